@@ -1,8 +1,8 @@
-"""A capture of a moving camera: the poses of a tracker, refined together, and depth of some frames.
+"""Refine the poses of a capture with a moving camera, and estimate depth of some frames.
 
-Give the folder of a phone's scan (transforms.json), a COLMAP model or any other layout that `geodiff
-capture` reads. Without a folder, a scene is rendered from a moving camera, with poses as inexact as a
-tracker's, so that the error can be printed. Needs the extra `capture`. Runs offline:
+Takes a phone scan (transforms.json), a COLMAP model or any other layout supported by `geodiff capture`.
+By default it renders a scene from a moving camera, with pose errors typical of a tracker, and prints the
+error of the depth. Needs the extra `capture`. Runs offline:
 
     python -m examples.capture_folder [scan/ --frames 0:100:10]
 """
@@ -24,36 +24,36 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def rendered_scan(folder: Path, size: tuple[int, int], frames: int) -> dict[str, np.ndarray]:
-    """Write a transforms.json with images; the true depth by frame."""
+    """Write a transforms.json with images; return ground-truth depth by frame."""
     sequence = render_sequence(3, frames, "room", size)
-    rng, said, truth = np.random.default_rng(0), [], {}
+    rng, said, ground_truth = np.random.default_rng(0), [], {}
     for i, (view, pose) in enumerate(zip(sequence.lefts, sequence.T_world_from_left, strict=True)):
         image = (view.image_01.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
         Image.fromarray(image).save(folder / f"frame{i}.png")
         given = pose.numpy() @ OPENGL
-        given[:3, 3] += rng.normal(0, 0.01, 3)  # a tracker's error, metres
+        given[:3, 3] += rng.normal(0, 0.01, 3)  # tracker error in metres
         said.append({"file_path": f"frame{i}.png", "transform_matrix": given.tolist()})
-        truth[f"frame{i}"] = view.depth_m[0].numpy()
+        ground_truth[f"frame{i}"] = view.depth_m[0].numpy()
     K = sequence.K.numpy()
     camera = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
     camera |= {"w": size[1], "h": size[0], "frames": said}
     (folder / "transforms.json").write_text(json.dumps(camera))
-    return truth
+    return ground_truth
 
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scan", nargs="?", type=Path, help="a capture; rendered if left out")
+    parser.add_argument("scan", nargs="?", type=Path, help="a capture (default: a rendered scene)")
     parser.add_argument("--frames", default="2:2", help="NAME,NAME or FIRST:LAST:STEP")
     parser.add_argument("--size", type=int, nargs=2, default=(192, 256), metavar=("H", "W"), help="pixels")
     parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
-    parser.add_argument("--steps", type=int, default=None, help="denoising steps; the prior's own by default")
+    parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     options = parser.parse_args(argv)
 
     with tempfile.TemporaryDirectory() as temporary:
-        truth = {} if options.scan else rendered_scan(Path(temporary), tuple(options.size), 6)
+        ground_truth = {} if options.scan else rendered_scan(Path(temporary), tuple(options.size), 6)
         capture = Capture.open(options.scan or temporary)
         solved = capture.solve()
         print(
@@ -67,9 +67,9 @@ def main(argv: list[str] | None = None) -> None:
             line = (
                 f"{name}: median {np.median(depth):.2f} m, neighbours {', '.join(capture.neighbours(name))}"
             )
-            if name in truth:
-                known = np.isfinite(truth[name]) & (truth[name] > 0)
-                line += f", AbsRel {np.mean(np.abs(depth / truth[name] - 1)[known]):.3f}"
+            if name in ground_truth:
+                known = np.isfinite(ground_truth[name]) & (ground_truth[name] > 0)
+                line += f", AbsRel {np.mean(np.abs(depth / ground_truth[name] - 1)[known]):.3f}"
             print(line)
 
 

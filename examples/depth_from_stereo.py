@@ -1,6 +1,6 @@
-"""Metric depth from a calibrated stereo pair: a plain diffusers script with two additional lines.
+"""Metric depth from a calibrated stereo pair: a diffusers script with two additional lines.
 
-Without arguments it runs offline, on the rendered pair and the small prior of the package:
+By default it runs offline on the bundled rendered pair with the bundled prior:
 
     python -m examples.depth_from_stereo
     python -m examples.depth_from_stereo left.png right.png calib.txt --prior prs-eth/marigold-depth-v1-1
@@ -28,11 +28,13 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("right", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "right.png")
     parser.add_argument("calib", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "calib.txt")
     parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
-    parser.add_argument("--steps", type=int, default=None, help="denoising steps; the prior's own by default")
-    parser.add_argument("--out", type=Path, default=Path("depth_from_stereo"), help="path without suffix")
+    parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("depth_from_stereo"), help="output path without suffix"
+    )
     options = parser.parse_args(argv)
 
-    # A photograph may carry its turn as a note; K belongs to the turned image.
+    # Apply the EXIF orientation, because K refers to the upright image.
     left, right = (ImageOps.exif_transpose(Image.open(path)) for path in (options.left, options.right))
 
     pipe = load_prior(options.prior)
@@ -47,13 +49,13 @@ def main(argv: list[str] | None = None) -> None:
     )
 
     depth_m = out.prediction[0, ..., 0]
-    array, picture = options.out.with_suffix(".npy"), options.out.with_suffix(".png")
+    array, image = options.out.with_suffix(".npy"), options.out.with_suffix(".png")
     np.save(array, depth_m)
-    depth_figure(depth_m).save(picture)
+    depth_figure(depth_m).save(image)
     print(f"{depth_m.min():.2f} m to {depth_m.max():.2f} m, median {np.median(depth_m):.2f} m")
-    print(f"{out.verdict.status}, mean confidence {out.confidence.mean():.2f} -> {array}, {picture}")
-    for sentence in out.warnings:
-        print(f"warning: {sentence}")
+    print(f"{out.verdict.status}, mean confidence {out.confidence.mean():.2f} -> {array}, {image}")
+    for finding in out.findings:
+        print(f"{finding.severity.value}: {finding}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Depth from known points: guided, and as Marigold V2's authors do it, by a LoRA fitted to every image.
+"""Depth completion from known points: by guidance, and by fitting a LoRA per image (Marigold V2's authors).
 
-The fit takes 100 Adam steps through the transformer for each image; the guided call takes one pass. Without a
-folder the script runs on a tiny prior with random weights, whose depth means nothing:
+The fit takes 100 Adam steps through the transformer per image; the guided call takes one pass. By default the
+script runs on a tiny prior with random weights, whose depth is meaningless:
 
     python -m examples.fitted_lora --points 500
     python -m examples.fitted_lora --points 500 --prior marigold-v2 --device cuda
@@ -24,15 +24,15 @@ from torch import Tensor
 
 from examples.marigold_v2 import tiny_marigold_v2
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 
-#: Least metres that the authors clamp to.
-NEAREST_M = 1e-3
-#: Most metres, likewise.
-FARTHEST_M = 1000.0
-#: Layers of a block that carry the checkpoint's LoRA, and so this one.
+#: Lower clamp of depth in metres, as in the authors' code.
+MIN_M = 1e-3
+#: Upper clamp of depth in metres, as in the authors' code.
+MAX_M = 1000.0
+#: Layers of a block with a LoRA, the same as in the checkpoint.
 TARGETS = re.compile(
     r"transformer_blocks\.(\d+)\.(attn\.(to_[qkv]|to_out\.0|add_[qkv]_proj|to_add_out)"
     r"|(img|txt)_mlp\.net\.(0\.proj|2))"
@@ -41,15 +41,15 @@ TARGETS = re.compile(
 
 @dataclass(frozen=True)
 class FittedLora:
-    """Hyperparameters of the fit, by default those of the authors.
+    """Hyperparameters of the fit (defaults: the authors').
 
     Attributes:
-        steps: of Adam.
-        rank: of the LoRA; its alpha is the same.
-        last_blocks: how many of the last transformer blocks get one, 0 for all.
-        rate: of the LoRA.
-        rate_affine: of scale and shift in log depth.
-        seed: of the LoRA's start.
+        steps: number of Adam steps.
+        rank: rank and alpha of the LoRA.
+        last_blocks: number of last transformer blocks with a LoRA, 0 for all.
+        rate: learning rate of the LoRA.
+        rate_affine: learning rate of scale and shift in log depth.
+        seed: seed of the LoRA's initialisation.
     """
 
     steps: int = 100
@@ -62,14 +62,14 @@ class FittedLora:
 
 @contextmanager
 def _adapter(transformer: torch.nn.Module, options: FittedLora) -> Iterator[list[Tensor]]:
-    """Low-rank additions to the outputs of linear layers, zero at first, taken off again at the end."""
+    """Add low-rank terms to the outputs of linear layers, initially zero; remove them at the end."""
     found = [(name, m, TARGETS.fullmatch(name)) for name, m in transformer.named_modules()]
     found = [(int(hit[1]), module) for _, module, hit in found if hit]
     first = 1 + max(block for block, _ in found) - options.last_blocks if options.last_blocks else 0
     generator = torch.Generator().manual_seed(options.seed)
     parameters, hooks = [], []
     for module in (module for block, module in found if block >= first):
-        bound = module.in_features**-0.5  # as a linear layer starts
+        bound = module.in_features**-0.5  # initialisation of a linear layer
         down = torch.rand(options.rank, module.in_features, generator=generator) * 2 * bound - bound
         up = torch.zeros(module.out_features, options.rank)
         pair = [x.to(transformer.device).requires_grad_() for x in (down, up)]
@@ -88,7 +88,7 @@ def _adapter(transformer: torch.nn.Module, options: FittedLora) -> Iterator[list
 
 
 def _least_squares(relative: Tensor, log_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale and shift of log depth at the points."""
+    """Return least-squares scale and shift of log depth at the points."""
     design = torch.stack([relative.double(), torch.ones_like(relative.double())], 1)
     return torch.linalg.lstsq(design, log_depth.double()[:, None]).solution[:, 0].float().unbind()
 
@@ -103,24 +103,24 @@ def complete_by_lora(
     """Fit a LoRA, a scale and a shift to the points of one image.
 
     Args:
-        pipe: affine in log depth; left as it was.
-        image: one image, as the pipeline takes it.
-        points_m: ``(H, W)`` metres of the image's size, 0 where unknown.
-        options: theirs by default; 0 steps leave the least-squares fit that they start from.
-        resolution: longer side for the prior, pixels; the pipeline's own for ``None``.
+        pipe: pipeline affine in log depth; unchanged afterwards.
+        image: one image, in any form accepted by the pipeline.
+        points_m: ``(H, W)`` metres in the image's size, 0 where unknown.
+        options: the authors' by default; 0 steps return the initial least-squares fit.
+        resolution: longer side for the prior, pixels (``None``: the pipeline's default).
 
     Returns:
         ``(H, W)`` metres.
 
     Raises:
-        ValueError: a prior that is not affine in log depth.
+        ValueError: the prior is not affine in log depth.
 
     Source: ``evaluation/depth_completion/run_marigold_v2.py`` of huawei-bayerlab/marigold-v2, with the loss
-    on the image's own pixels. The LoRA is made of hooks, so that nothing has to be installed for it.
+    on the image's own pixels. The LoRA is implemented with hooks, so it needs no further package.
     """
     options = FittedLora() if options is None else options
     if pipe.config.prediction_type != "log":
-        bad_value("the prior", "affine in log depth, as theirs", f"{pipe.config.prediction_type!r}")
+        bad_value("the prior", "affine in log depth", f"{pipe.config.prediction_type!r}")
     resolution = pipe.default_processing_resolution if resolution is None else resolution
     device = pipe._execution_device
     padded, _, _ = pipe.image_processor.preprocess(image, resolution, device=device, dtype=pipe.dtype)
@@ -152,14 +152,14 @@ def complete_by_lora(
 def _fit(
     relative: Any, parameters: list[Tensor], known: Tensor, target: Tensor, options: FittedLora
 ) -> Tensor:
-    """Adam on L1 + L2 in metres at the points; the depth after the last step."""
-    nearest, farthest = (float(torch.tensor(m).log()) for m in (NEAREST_M, FARTHEST_M))
+    """Minimise L1 + L2 in metres at the points with Adam; return the depth after the last step."""
+    nearest, farthest = (float(torch.tensor(m).log()) for m in (MIN_M, MAX_M))
 
     def metres(a: Tensor, b: Tensor) -> Tensor:
         return torch.exp(torch.clamp(a * relative() + b, nearest, farthest))
 
     with torch.no_grad():
-        a, b = _least_squares(relative()[known], target.clamp_min(NEAREST_M).log())
+        a, b = _least_squares(relative()[known], target.clamp_min(MIN_M).log())
     a, b = a.clone().requires_grad_(), b.clone().requires_grad_()
     groups = [
         {"params": parameters, "lr": options.rate},
@@ -171,7 +171,7 @@ def _fit(
             found = metres(a, b)[known]
             loss = F.l1_loss(found, target) + F.mse_loss(found, target)
         optimiser.zero_grad()
-        # The last block's answer to the prompt is read by nobody, so its LoRA has no gradient.
+        # The last block's text output is unused, so its LoRA has no gradient.
         gradients = torch.autograd.grad(loss, [*parameters, a, b], allow_unused=True)
         for parameter, gradient in zip([*parameters, a, b], gradients, strict=True):
             parameter.grad = gradient
@@ -180,19 +180,19 @@ def _fit(
         return metres(a, b)
 
 
-#: Longer side at which the tiny prior works; a folder's own default otherwise.
+#: Longer side for the tiny prior; a prior folder has its own default.
 TINY_RESOLUTION = 192
 
 
 @dataclass(frozen=True)
 class Completion:
-    """One way to complete the points.
+    """Result of one completion method.
 
     Attributes:
-        name: of the way.
-        seconds: of its call.
-        passes: through the transformer; each of a fitted LoRA's steps goes back through it as well.
-        mae_m: metres, mean absolute error over the truth that was not given.
+        name: name of the method.
+        seconds: duration of its call.
+        passes: number of passes through the transformer; each step of a fitted LoRA also has a backward pass.
+        mae_m: mean absolute error in metres over ground truth that was not given.
         abs_rel: mean relative error over the same pixels.
     """
 
@@ -204,7 +204,7 @@ class Completion:
 
 
 def draw_points(pair: DemoPair, count: int, seed: int = 0) -> np.ndarray:
-    """``(H, W)`` metres with ``count`` pixels of the truth, 0 elsewhere."""
+    """Return ``(H, W)`` metres with ``count`` pixels of the ground truth, 0 elsewhere."""
     rows, columns = np.nonzero(pair.valid)
     chosen = np.random.default_rng(seed).choice(len(rows), min(count, len(rows)), replace=False)
     points = np.zeros_like(pair.depth_m)
@@ -215,14 +215,14 @@ def draw_points(pair: DemoPair, count: int, seed: int = 0) -> np.ndarray:
 def compare_completions(
     pipe: MarigoldV2Pipeline, pair: DemoPair, points: np.ndarray, resolution: int, options: FittedLora
 ) -> list[Completion]:
-    """Run every way once, after a plain call that takes the first-call costs.
+    """Run every method once, after a warm-up call.
 
     Args:
-        pipe: affine in log depth.
-        pair: the image and its truth.
+        pipe: pipeline affine in log depth.
+        pair: the image and its ground truth.
         points: ``(H, W)`` metres, 0 where unknown.
         resolution: longer side for the prior, pixels.
-        options: of the fitted LoRA.
+        options: options of the fitted LoRA.
     """
     guided_pipe = enable_geometry_guidance(pipe)
     pipe.set_progress_bar_config(disable=True)
@@ -233,8 +233,8 @@ def compare_completions(
         sparse = torch.from_numpy(points)
         return lambda: complete_by_lora(pipe, pair.left, sparse, own, resolution).cpu().numpy()
 
-    def guided(**knobs: Any) -> Callable[[], np.ndarray]:
-        guidance = GeometryGuidance.from_points(points, pair.rig.K_left, **knobs)
+    def guided(**overrides: Any) -> Callable[[], np.ndarray]:
+        guidance = GeometryGuidance.from_points(points, pair.rig.K_left, **overrides)
         return lambda: guided_pipe(pair.left, guidance=guidance, processing_resolution=resolution).prediction[
             0, ..., 0
         ]
@@ -265,7 +265,9 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--points", type=int, default=500, help="drawn from the demo pair's truth")
+    parser.add_argument(
+        "--points", type=int, default=500, help="number of points drawn from the demo pair's ground truth"
+    )
     parser.add_argument("--prior", help="folder from `geodiff convert marigold-v2`, in log depth")
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args(argv)
@@ -280,7 +282,7 @@ def main(argv: list[str] | None = None) -> None:
             bad_value("--prior", "a Marigold V2 in log depth", options.prior)
         resolution = pipe.default_processing_resolution
     pair = read_demo_pair()
-    print(f"{name}; {options.points} points of the demo pair's truth; longer side {resolution} px")
+    print(f"{name}; {options.points} points of the demo pair's ground truth; longer side {resolution} px")
     print(f"{options.device}, {torch.get_num_threads()} threads, torch {torch.__version__}")
     print(f"{'':<34}{'seconds':>9}{'passes':>8}{'MAE m':>9}{'AbsRel':>9}", flush=True)
     points = draw_points(pair, options.points)

@@ -1,7 +1,7 @@
 """Marigold V2 as a prior: one step of a large transformer, made metric by a second view.
 
-``geodiff convert marigold-v2`` makes the folder (docs/reference/priors.md). Without a folder the script runs
-offline on a tiny model with random weights, whose depth means nothing:
+``geodiff convert marigold-v2`` creates the folder (docs/reference/priors.md). By default the script runs
+offline on a tiny model with random weights, whose depth is meaningless:
 
     python examples/marigold_v2.py
     python examples/marigold_v2.py left.png right.png calib.txt --prior marigold-v2 --device cuda
@@ -24,7 +24,8 @@ from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.priors.components import FixedPrompt
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 
-#: A transformer and an autoencoder of Qwen-Image's classes, some 280 000 weights together.
+#: Configuration of a tiny transformer and autoencoder of Qwen-Image's classes, about 280 000 weights in
+#: total.
 TINY_TRANSFORMER = {
     "num_layers": 2,
     "attention_head_dim": 16,
@@ -36,18 +37,20 @@ TINY_VAE = {"base_dim": 4, "dim_mult": [1, 2, 4, 4], "num_res_blocks": 1}
 
 
 def tiny_marigold_v2(seed: int = 0, space: str = "log") -> MarigoldV2Pipeline:
-    """A tiny Marigold V2 with random weights, float32, at 64 px.
+    """Build a tiny Marigold V2 with random weights, float32, at 64 px.
 
     Args:
-        seed: of the weights.
-        space: what its map is affine in.
+        seed: seed of the weights.
+        space: prediction space.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         transformer = QwenImageTransformer2DModel(**TINY_TRANSFORMER).eval()
         vae, prompt = AutoencoderKLQwenImage(**TINY_VAE).eval(), FixedPrompt(5, 16)
         torch.nn.init.normal_(prompt.embedding)
-        torch.nn.init.normal_(vae.decoder.conv_out.weight, std=0.3)  # as initialised the map is nearly flat
+        torch.nn.init.normal_(
+            vae.decoder.conv_out.weight, std=0.3
+        )  # the default initialisation gives a nearly flat map
     pipe = MarigoldV2Pipeline(
         transformer,
         vae,
@@ -77,9 +80,9 @@ def main(argv: list[str] | None = None) -> None:
 
     with tempfile.TemporaryDirectory() as tiny:
         if options.prior is None:
-            print("no --prior: a tiny Marigold V2 with random weights, which knows nothing of depth")
+            print("No --prior: using a tiny Marigold V2 with random weights, whose depth is meaningless")
             tiny_marigold_v2().save_pretrained(tiny)
-        # They trained in bfloat16; a CPU is faster in float32.
+        # The model was trained in bfloat16; a CPU is faster in float32.
         dtype = torch.float32 if options.device == "cpu" else torch.bfloat16
         pipe = load_prior(options.prior or tiny, device=options.device, dtype=dtype)
     print(f"affine in {pipe.config.prediction_type} depth")
@@ -89,8 +92,8 @@ def main(argv: list[str] | None = None) -> None:
     out = pipe(left, guidance=guidance)
     depth_m = out.prediction[0, ..., 0]
     print(f"median {np.median(depth_m):.2f} m, {time.perf_counter() - started:.1f} s")
-    for sentence in out.warnings:
-        print(f"warning: {sentence}")
+    for finding in out.findings:
+        print(f"{finding.severity.value}: {finding}")
     np.save(options.out, depth_m)
     print(options.out)
 

@@ -1,17 +1,17 @@
-"""Poses of Depth Anything 3, VGGT or MapAnything as a capture: transforms.json, then depth in metres.
+"""Convert poses of Depth Anything 3, VGGT or MapAnything to a capture (transforms.json) for metric depth.
 
-These networks return a pose and intrinsics for every image, for the size at which they processed it and
-without a metric scale. This script writes a transforms.json beside the images, which `geodiff capture`
-reads; with --known-length its results are in metres. Files of predictions are .npz:
+These networks return a pose and intrinsics per image, for the size at which they processed it and without a
+metric scale. This script writes a transforms.json next to the images, which `geodiff capture` reads; with
+--known-length its results are in metres. Prediction files are .npz:
 
     da3           extrinsics (N, 3, 4) world-to-camera, intrinsics (N, 3, 3)
-    vggt          extrinsic (N, 3, 4) world-to-camera, intrinsic (N, 3, 3), of pose_encoding_to_extri_intri
+    vggt          extrinsic (N, 3, 4) world-to-camera, intrinsic (N, 3, 3), from pose_encoding_to_extri_intri
     mapanything   camera_poses (N, 4, 4) camera-to-world, intrinsics (N, 3, 3)
 
 each with the size of the network's images as `size` (width, height), or with `depth` or `images` of that
-size. All three use OpenCV's axes. VGGT scales an image to a fixed width and crops the height around the
-middle, or pads it to a square (--padded). Runs offline; without arguments, on small made-up predictions of
-all three:
+size. All three use OpenCV's axes. VGGT scales an image to a fixed width and crops its height around the
+centre, or pads it to a square (--padded). By default the script runs offline on small synthetic predictions
+of all three:
 
     python -m examples.network_poses vggt predictions.npz images/
     geodiff capture images/ --out depth --known-length NAME:X1,Y1,X2,Y2,METRES
@@ -29,9 +29,9 @@ from PIL import Image
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SUFFIXES = (".jpg", ".jpeg", ".png")
-#: Sides are rounded to multiples of 14; ratios that differ by more are of a crop.
+#: Sides are rounded to multiples of 14; a larger difference of the aspect ratios indicates a crop.
 SAME_SHAPE = 0.05
-#: Of every network: keys of poses and intrinsics, and whether poses are world-to-camera.
+#: Keys of poses and intrinsics, and whether poses are world-to-camera, per network.
 NETWORKS = {
     "da3": ("extrinsics", "intrinsics", True),
     "vggt": ("extrinsic", "intrinsic", True),
@@ -40,7 +40,7 @@ NETWORKS = {
 
 
 def camera_to_world(poses: np.ndarray, world_to_camera: bool) -> np.ndarray:
-    """``(N, 4, 4)`` of ``(N, 3, 4)`` or ``(N, 4, 4)``; a leading axis of one batch is dropped."""
+    """Return ``(N, 4, 4)`` camera-to-world poses from ``(N, 3, 4)`` or ``(N, 4, 4)``, possibly batched."""
     poses = np.asarray(poses, float).reshape(-1, *np.shape(poses)[-2:])
     E = np.tile(np.eye(4), (len(poses), 1, 1))
     E[:, : poses.shape[1]] = poses
@@ -48,7 +48,7 @@ def camera_to_world(poses: np.ndarray, world_to_camera: bool) -> np.ndarray:
 
 
 def network_size(data: dict[str, np.ndarray]) -> tuple[int, int]:
-    """``(width, height)`` of the network's images."""
+    """Return ``(width, height)`` of the network's images."""
     if "size" in data:
         return int(data["size"][0]), int(data["size"][1])
     if "depth" in data:
@@ -58,11 +58,11 @@ def network_size(data: dict[str, np.ndarray]) -> tuple[int, int]:
         images = data["images"]
         sides = images.shape[-2:] if images.shape[-3] == 3 else images.shape[-3:-1]
         return sides[1], sides[0]
-    raise SystemExit("The file needs the size of the network's images: size, depth or images.")
+    raise SystemExit("The file lacks the size of the network's images; add size, depth or images.")
 
 
 def to_image(K: np.ndarray, of: tuple[int, int], size: tuple[int, int], padded: bool) -> np.ndarray:
-    """Intrinsics of a network's image for the photograph that it was scaled, and cropped or padded, from."""
+    """Convert intrinsics of a network's (scaled, cropped or padded) image to the original image."""
     factors = np.array(size) / np.array(of)
     if abs(factors[0] / factors[1] - 1) > SAME_SHAPE:
         factors = np.full(2, max(size) / max(of) if padded else size[0] / of[0])
@@ -71,14 +71,16 @@ def to_image(K: np.ndarray, of: tuple[int, int], size: tuple[int, int], padded: 
 
 
 def write_transforms(network: str, predictions: Path, images: Path, padded: bool = False) -> Path:
-    """Write ``images/transforms.json`` for images that were given to the network in order of their names."""
+    """Write ``images/transforms.json`` for images passed to the network in order of their names."""
     poses, intrinsics, world_to_camera = NETWORKS[network]
     with np.load(predictions) as file:
         data = dict(file)
     E, Ks = camera_to_world(data[poses], world_to_camera), data[intrinsics].reshape(-1, 3, 3)
     paths = sorted(path for path in images.iterdir() if path.suffix.lower() in SUFFIXES)
     if len(paths) != len(E):
-        raise SystemExit(f"{len(E)} poses for {len(paths)} images in {images}: are they the network's input?")
+        raise SystemExit(
+            f"{len(E)} poses for {len(paths)} images in {images}: Check that this is the network's input."
+        )
     frames = []
     for path, pose, K in zip(paths, E, Ks, strict=True):
         with Image.open(path) as image:
@@ -91,7 +93,7 @@ def write_transforms(network: str, predictions: Path, images: Path, padded: bool
             "h": size[1],
         }
         frame |= {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
-        frames.append(frame | {"colmap_im_id": len(frames)})  # says that lengths are in no known unit
+        frames.append(frame | {"colmap_im_id": len(frames)})  # marks lengths as having no known unit
     path = images / "transforms.json"
     path.write_text(json.dumps({"frames": frames}, indent=1))
     return path
@@ -100,13 +102,13 @@ def write_transforms(network: str, predictions: Path, images: Path, padded: bool
 def stub(
     network: str, folder: Path, size: tuple[int, int] = (640, 480), of: tuple[int, int] = (518, 392)
 ) -> Path:
-    """A file as the network would leave it, beside three images, for trying this out."""
+    """Write a synthetic prediction of a network next to three images."""
     poses, intrinsics, world_to_camera = NETWORKS[network]
     rng, E = np.random.default_rng(0), np.tile(np.eye(4), (3, 1, 1))
     E[:, 0, 3] = 0.1, 0.2, 0.4
     for number in range(3):
-        picture = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
-        Image.fromarray(picture).save(folder / f"{number}.png")
+        rgb = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+        Image.fromarray(rgb).save(folder / f"{number}.png")
     K = np.array([[400.0, 0, of[0] / 2 - 0.5], [0, 400.0, of[1] / 2 - 0.5], [0, 0, 1]])
     given = np.linalg.inv(E)[:, :3] if world_to_camera else E
     data = {poses: given, intrinsics: np.tile(K, (3, 1, 1)), "size": np.array(of)}
@@ -119,10 +121,10 @@ def main(argv: list[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "network", nargs="?", choices=NETWORKS, help="what made the file; all stubs if left out"
+        "network", nargs="?", choices=NETWORKS, help="source of the file (default: synthetic files of all)"
     )
     parser.add_argument("predictions", nargs="?", type=Path, help=".npz of the network's output")
-    parser.add_argument("images", nargs="?", type=Path, help="folder of the images that it was given")
+    parser.add_argument("images", nargs="?", type=Path, help="folder with the network's input images")
     parser.add_argument("--padded", action="store_true", help="images were padded to a square, not cropped")
     options = parser.parse_args(argv)
     if options.predictions and options.images:
@@ -136,7 +138,7 @@ def main(argv: list[str] | None = None) -> None:
             frame = capture.frame("2")
             print(
                 f"{network}: {len(capture)} frames, unit {capture.unit}, 2 at {frame.E[:3, 3].round(3)}, "
-                f"focal length {frame.K[0, 0]:.1f} px"
+                f"focal length {frame.camera.K[0, 0]:.1f} px"
             )
 
 

@@ -1,11 +1,11 @@
-"""Run the published priors whose trained weights are cached, and write a page with their errors.
+"""Run the published priors whose weights are cached, and write a page with their errors.
 
-    python -m examples.proof                                     # the priors of PUBLISHED on the bundled pair
+    python -m examples.proof                                     # priors of PUBLISHED on the bundled pair
     python -m examples.proof prs-eth/marigold-depth-v1-1 ./lotus-depth-g-v1-0 --data ~/stereo --out proof.md
 
-Nothing is downloaded: a hub id that is not cached is listed as absent. ``--data`` takes any folder that
-``geodiff eval pairs`` takes. Plain is the prior's own map, aligned with the truth by least squares; guided is
-the result in metres, compared as it is.
+Downloads nothing: a hub id that is not cached is listed as absent. ``--data`` takes the same folders as
+``geodiff eval pairs``. "Plain" is the prior's own map, aligned to ground truth by least squares; "guided" is
+the metric result without alignment.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from geodiff_plugin.priors import find_prior, prior_of
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed, versions
 
-#: Hub id -> AbsRel that its authors publish, aligned, per cent; empty where we did not read one.
+#: Hub id -> aligned AbsRel published by its authors, in per cent; empty if unknown to us.
 PUBLISHED = {
     "prs-eth/marigold-depth-v1-1": "",
     "prs-eth/marigold-depth-lcm-v1-0": "",
@@ -46,16 +46,16 @@ BLOCK_BYTES = 1 << 24
 
 @dataclass(frozen=True)
 class Pair:
-    """Two posed views with the truth of the left one.
+    """Two posed views with ground truth of the left one.
 
     Attributes:
-        name: for the page.
+        name: name on the page.
         left: ``(H, W, 3)`` image.
-        right: likewise.
-        K: of both cameras.
+        right: ``(H, W, 3)`` image.
+        K: intrinsics of both cameras.
         E: pose of the right camera in the left camera's frame, metres.
         depth_m: ``(H, W)`` metres.
-        valid: ``(H, W)`` bool, where they are known.
+        valid: ``(H, W)`` bool, true where depth is known.
     """
 
     name: str
@@ -69,16 +69,16 @@ class Pair:
 
 @dataclass
 class Proof:
-    """What is known of one prior after its run.
+    """Results of one prior.
 
     Attributes:
-        name: as it was asked for.
-        absent: why it could not be run; empty where it was.
+        name: name as requested.
+        absent: why it was not run; empty if it was.
         facts: adapter, licence and hash of the weights.
-        plain: AbsRel of the aligned plain map, one a pair.
-        guided: AbsRel of the guided result, one a pair.
-        seconds: of the plain and of the guided call, one a pair.
-        peak_bytes: of memory, over all calls.
+        plain: AbsRel of the aligned plain map, per pair.
+        guided: AbsRel of the guided result, per pair.
+        seconds: durations of the plain and of the guided call, per pair.
+        peak_bytes: peak memory over all calls.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Proof:
 
 
 def pairs_of(data: Path | None, most: int | None) -> Iterator[Pair]:
-    """The bundled pair, then the first ``most`` of a folder of data sets."""
+    """Yield the bundled pair, then the first ``most`` of a folder of data sets."""
     demo = read_demo_pair()
     rig = demo.rig
     yield Pair("bundled", demo.left, demo.right, (rig.K_left, rig.K_right), rig.E, demo.depth_m, demo.valid)
@@ -102,7 +102,7 @@ def pairs_of(data: Path | None, most: int | None) -> Iterator[Pair]:
 
 
 def weights_hash(layout: Layout) -> str:
-    """16 hexadecimal digits of all safetensors of a folder, by name."""
+    """Return 16 hexadecimal digits that identify all safetensors of a folder."""
     digest = hashlib.sha256()
     for file in sorted(layout.folder.rglob("*.safetensors")):
         digest.update(file.relative_to(layout.folder).as_posix().encode())
@@ -116,11 +116,11 @@ def prove(name: str, pairs: list[Pair], device: torch.device, dtype: torch.dtype
     """Run one prior over all pairs, plain and guided.
 
     Args:
-        name: anything that ``load_prior`` takes.
-        pairs: to run it on.
-        device: where.
-        dtype: of the networks.
-        seed: of the initial noise.
+        name: any name accepted by ``load_prior``.
+        pairs: pairs to run it on.
+        device: device of the prior.
+        dtype: precision of the networks.
+        seed: seed of the initial noise.
     """
     try:
         recognised = find_prior(name, local_files_only=True)
@@ -131,9 +131,9 @@ def prove(name: str, pairs: list[Pair], device: torch.device, dtype: torch.dtype
     proof = Proof(name, facts=(recognised.key, recognised.licence, weights_hash(recognised.layout)))
     space, results = prior_of(pipe).space, {}
 
-    def call(key: str, pair: Pair, **told: Any) -> float:
+    def call(key: str, pair: Pair, **reported: Any) -> float:
         seeded = torch.Generator(device).manual_seed(seed)
-        return timed(lambda: results.update({key: pipe(pair.left, generator=seeded, **told)}), device)
+        return timed(lambda: results.update({key: pipe(pair.left, generator=seeded, **reported)}), device)
 
     for pair in pairs:
         guidance = GeometryGuidance(pair.right, pair.K, pair.E)
@@ -141,15 +141,15 @@ def prove(name: str, pairs: list[Pair], device: torch.device, dtype: torch.dtype
             proof.seconds.append((call("plain", pair), call("guided", pair, guidance=guidance)))
         proof.peak_bytes = max(proof.peak_bytes, memory.peak_bytes)
         plain, guided = (np.asarray(results[key].prediction)[0, ..., 0] for key in ("plain", "guided"))
-        truth = pair.depth_m, pair.valid
-        aligned = align(plain, *truth, space)
-        proof.plain.append(evaluate_depth(aligned, *truth)["abs_rel"])
-        proof.guided.append(evaluate_depth(guided, *truth)["abs_rel"])
+        ground_truth = pair.depth_m, pair.valid
+        aligned = align(plain, *ground_truth, space)
+        proof.plain.append(evaluate_depth(aligned, *ground_truth)["abs_rel"])
+        proof.guided.append(evaluate_depth(guided, *ground_truth)["abs_rel"])
     return proof
 
 
 def page(proofs: list[Proof], pairs: list[Pair], device: torch.device, dtype: torch.dtype) -> str:
-    """The report in Markdown."""
+    """Return the report in Markdown."""
     machine = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
     lines = ["# Priors with their weights", "", f"Pairs: {', '.join(pair.name for pair in pairs)}.", ""]
     lines += [f"On {machine}, {str(dtype).removeprefix('torch.')}; "]
@@ -176,11 +176,16 @@ def page(proofs: list[Proof], pairs: list[Pair], device: torch.device, dtype: to
         lines.append(f"| {' | '.join([*row, f'{proof.peak_bytes / 1e9:.1f}'])} |")
     lines += [
         "",
-        "AbsRel in the mean over the pairs; `authors` is what they publish for their data sets, per cent.",
+        "Mean AbsRel over the pairs; `authors`: published by the authors for their data sets, in per cent.",
     ]
     absent = [proof for proof in proofs if proof.absent]
     if absent:
-        lines += ["", "## Not on this machine", "", *(f"- {proof.name}: {proof.absent}" for proof in absent)]
+        lines += [
+            "",
+            "## Not available on this machine",
+            "",
+            *(f"- {proof.name}: {proof.absent}" for proof in absent),
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -188,9 +193,9 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("priors", nargs="*", help="hub ids and folders; those of PUBLISHED if none")
-    parser.add_argument("--data", type=Path, help="folder of data sets, beside the bundled pair")
-    parser.add_argument("--pairs", type=int, help="at most so many of them")
+    parser.add_argument("priors", nargs="*", help="hub ids and folders (default: those of PUBLISHED)")
+    parser.add_argument("--data", type=Path, help="folder of data sets, in addition to the bundled pair")
+    parser.add_argument("--pairs", type=int, help="maximum number of pairs")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")
     parser.add_argument("--out", type=Path, default=Path("proof.md"))

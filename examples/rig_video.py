@@ -1,13 +1,13 @@
-"""A video of a stereo rig, frame by frame, as a video of metric depth.
+"""Convert a stereo video to a metric depth video, frame by frame.
 
-LEFT and RIGHT are two videos of the same length. Without arguments the script runs offline, on a rendered
-rig that moves through a scene:
+LEFT and RIGHT are two videos of the same length. By default the script runs offline on a rendered rig that
+moves through a scene:
 
     python -m examples.rig_video
     python -m examples.rig_video left.mp4 right.mp4 calib.txt --frames 50 --out depth.mp4
 
-``geodiff depth left.mp4 right.mp4`` does the same with several frames in progress and resumes where it was
-interrupted, and with ``--steady`` without flicker (docs/how-to/sequences.md).
+``geodiff depth left.mp4 right.mp4`` does the same, processes several frames concurrently and resumes
+interrupted runs; ``--temporal-smoothing`` reduces flicker (docs/how-to/sequences.md).
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ import numpy as np
 import torch
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
-from geodiff_plugin.formats.recordings import VideoReader, video_facts
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.formats import VideoReader, video_facts
 from geodiff_plugin.plotting import depth_frames, write_depth_video
 from tests.scenes.sequences import render_sequence
 
 
 def read_frames(left: Path, right: Path, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The first frames of both videos, ``(H, W, 3)`` in [0, 1] each; as many as both have, at most."""
+    """Yield the first frames of both videos, ``(H, W, 3)`` in [0, 1] each, up to ``count``."""
     count = min(count, video_facts(left).frames, video_facts(right).frames)
     with VideoReader(left) as lefts, VideoReader(right) as rights:
         for i in range(count):
@@ -35,11 +36,11 @@ def read_frames(left: Path, right: Path, count: int) -> Iterator[tuple[np.ndarra
 
 
 def rendered_rig(count: int) -> tuple[list[tuple[Any, Any]], Rig]:
-    """Frames of a rig that moves through a rendered room, and its calibration."""
+    """Render frames of a rig that moves through a room; return them and its calibration."""
     sequence = render_sequence(3, count, "room", (144, 192))
     frames = zip(sequence.lefts, sequence.rights, strict=True)
-    K = sequence.K.numpy()
-    return [(left.image_01, right.image_01) for left, right in frames], Rig(K, K, sequence.E.numpy())
+    camera, pairs = Camera(sequence.K.numpy()), [(left.image_01, right.image_01) for left, right in frames]
+    return pairs, Rig(camera, camera, sequence.E.numpy())
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -47,15 +48,19 @@ def main(argv: list[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "files", type=Path, nargs="*", metavar="LEFT RIGHT CALIB", help="rendered ones by default"
+        "files",
+        type=Path,
+        nargs="*",
+        metavar="LEFT RIGHT CALIB",
+        help="two videos and a calibration (default: rendered)",
     )
-    parser.add_argument("--frames", type=int, default=4, help="how many at most, from the first one")
+    parser.add_argument("--frames", type=int, default=4, help="maximum number of frames, from the first")
     parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
-    parser.add_argument("--steps", type=int, default=None, help="denoising steps; the prior's own by default")
+    parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     parser.add_argument("--out", type=Path, default=Path("rig_video.webp"), help=".webp, .gif or .mp4")
     options = parser.parse_args(argv)
     if len(options.files) not in (0, 3):
-        parser.error("give two videos and a calibration, or none of them")
+        parser.error("expected two videos and a calibration, or no files")
 
     if options.files:
         *videos, calib = options.files
@@ -66,7 +71,7 @@ def main(argv: list[str] | None = None) -> None:
     pipe = enable_geometry_guidance(load_prior(options.prior))
     depths_m = []
     for left, right in frames:
-        # The same noise for every frame keeps flicker low.
+        # The same noise for every frame reduces flicker.
         out = pipe(
             left,
             guidance=GeometryGuidance(right, (rig.K_left, rig.K_right), rig.E, left_size=rig.size_left),
@@ -75,8 +80,8 @@ def main(argv: list[str] | None = None) -> None:
         )
         depths_m.append(out.prediction[0, ..., 0])
         print(f"frame {len(depths_m)}: median {np.median(depths_m[-1]):.2f} m")
-        for sentence in out.warnings:
-            print(f"warning: {sentence}")
+        for finding in out.findings:
+            print(f"{finding.severity.value}: {finding}")
     write_depth_video(options.out, depth_frames(depths_m), fps=10)
     print(options.out)
 

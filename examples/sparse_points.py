@@ -1,8 +1,8 @@
-"""Depth completion: one image and sparse depths, of a lidar or of structure from motion.
+"""Depth completion from one image and sparse depth (lidar, structure from motion).
 
 POINTS is a ``.npy`` file: ``(N, 3)`` points in the camera's frame, or a sparse map ``(H, W)`` with 0 where
-the depth is unknown, in metres. K is a text file of 3 x 3 numbers, in pixels. Without arguments the script
-runs offline and completes 500 depths of the rendered pair that ships with the package:
+the depth is unknown, in metres. K is a text file of 3 x 3 numbers, in pixels. By default the script
+runs offline and completes 500 depths of the bundled rendered pair:
 
     python -m examples.sparse_points
     python -m examples.sparse_points image.png points.npy K.txt
@@ -26,25 +26,29 @@ def main(argv: list[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "files", type=Path, nargs="*", metavar="IMAGE POINTS K", help="rendered ones by default"
+        "files",
+        type=Path,
+        nargs="*",
+        metavar="IMAGE POINTS K",
+        help="image, points and K (default: rendered)",
     )
     parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
-    parser.add_argument("--steps", type=int, default=None, help="denoising steps; the prior's own by default")
+    parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     parser.add_argument("--out", type=Path, default=Path("sparse_points.npy"), help="depth, metres")
     options = parser.parse_args(argv)
     if len(options.files) not in (0, 3):
-        parser.error("give an image, its points and K, or none of them")
+        parser.error("expected an image, its points and K, or no files")
 
-    truth_m = None
+    ground_truth_m = None
     if options.files:
         image = ImageOps.exif_transpose(Image.open(options.files[0]))
         points, K = np.load(options.files[1]), np.loadtxt(options.files[2])
     else:
         pair = read_demo_pair()
-        image, K, truth_m = pair.left, pair.rig.K_left, pair.depth_m
+        image, K, ground_truth_m = pair.left, pair.rig.K_left, pair.depth_m
         chosen = np.random.default_rng(0).choice(np.flatnonzero(pair.valid), 500, replace=False)
-        points = np.zeros_like(truth_m)
-        points.flat[chosen] = truth_m.flat[chosen]
+        points = np.zeros_like(ground_truth_m)
+        points.flat[chosen] = ground_truth_m.flat[chosen]
 
     pipe = enable_geometry_guidance(load_prior(options.prior))
     out = pipe(
@@ -58,12 +62,12 @@ def main(argv: list[str] | None = None) -> None:
     np.save(options.out, depth_m)
     print(f"{depth_m.min():.2f} m to {depth_m.max():.2f} m, median {np.median(depth_m):.2f} m")
     print(f"{out.verdict.status}, mean confidence {out.confidence.mean():.2f} -> {options.out}")
-    if truth_m is not None:
+    if ground_truth_m is not None:
         withheld = pair.valid & (points == 0)
-        error = np.abs(depth_m - truth_m)[withheld] / truth_m[withheld]
-        print(f"mean relative error where no point was given: {error.mean():.3f}")
-    for sentence in out.warnings:
-        print(f"warning: {sentence}")
+        error = np.abs(depth_m - ground_truth_m)[withheld] / ground_truth_m[withheld]
+        print(f"mean relative error at pixels without a given depth: {error.mean():.3f}")
+    for finding in out.findings:
+        print(f"{finding.severity.value}: {finding}")
 
 
 if __name__ == "__main__":

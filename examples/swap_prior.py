@@ -1,7 +1,7 @@
-"""One pair through several priors, drawn side by side in the same colours.
+"""Compare several priors on one pair, side by side with the same colour scale.
 
-The guidance does not change, only the name of the prior does. Without arguments it runs offline, with the
-small prior of the package alone:
+Only the name of the prior changes; the guidance is the same. By default the script runs offline with the
+bundled prior only:
 
     python -m examples.swap_prior
     python -m examples.swap_prior left.png right.png calib.txt --prior bundled \
@@ -32,8 +32,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("left", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "left.png")
     parser.add_argument("right", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "right.png")
     parser.add_argument("calib", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "calib.txt")
-    parser.add_argument("--prior", action="append", help="'bundled', a hub id or a folder; again for another")
-    parser.add_argument("--out", type=Path, default=Path("swap_prior.png"), help="the picture")
+    parser.add_argument("--prior", action="append", help="'bundled', a hub id or a folder; may be repeated")
+    parser.add_argument("--out", type=Path, default=Path("swap_prior.png"), help="output image")
     options = parser.parse_args(argv)
 
     left, right = (ImageOps.exif_transpose(Image.open(path)) for path in (options.left, options.right))
@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> None:
     for name in options.prior or ["bundled"]:
         found = find_prior(name)
         print(f"{name}: {found.key}; {found.licence}")
-        pipe = enable_geometry_guidance(found.load())  # the only lines that know the prior
+        pipe = enable_geometry_guidance(found.load())  # the only lines that depend on the prior
 
         started = time.perf_counter()
         out = pipe(left, guidance=guidance, generator=torch.Generator("cpu").manual_seed(0))
@@ -53,14 +53,14 @@ def main(argv: list[str] | None = None) -> None:
         print(f"  median {np.median(depth_m):.2f} m, {seconds:.1f} s")
         if maps:
             print(f"  {np.median(np.abs(depth_m / maps[0] - 1)):.1%} from the first prior's depth")
-        for sentence in out.warnings:
-            print(f"  warning: {sentence}")
+        for finding in out.findings:
+            print(f"  {finding.severity.value}: {finding}")
         maps.append(depth_m)
         titles.append(f"{Path(name).name} ({found.key})")
 
-    near, far = depth_range(np.concatenate(maps))  # one scale of colours, so that maps can be compared
-    pictures = [left, *(colour_depth(depth_m, near=near, far=far) for depth_m in maps)]
-    grid(pictures, [f"left image; colours: {near:.2f} m to {far:.2f} m", *titles]).save(options.out)
+    near, far = depth_range(np.concatenate(maps))  # one colour scale, so that maps are comparable
+    images = [left, *(colour_depth(depth_m, near=near, far=far) for depth_m in maps)]
+    grid(images, [f"left image; colours: {near:.2f} m to {far:.2f} m", *titles]).save(options.out)
     print(f"{options.out}")
 
 

@@ -1,4 +1,7 @@
-"""``python -m geodiff_plugin`` is the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``)."""
+"""``python -m geodiff_plugin`` is the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``).
+
+Layer 14: imports ``cli``.
+"""
 
 from geodiff_plugin.cli.app import main
 

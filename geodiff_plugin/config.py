@@ -1,63 +1,39 @@
-"""Every number and switch of the guidance: one flat, frozen configuration, and its presets.
+"""Define all guidance parameters as one flat, frozen configuration, and its presets.
 
-docs/reference/knobs.md, which is made from this module, says which of them S5.1 and Algorithm 1 name.
+docs/reference/parameters.md, which is made from this module, lists which of them S5.1 and Algorithm 1 name.
+
+Layer 1: imports ``settings``; everything above imports it.
 """
 
 from __future__ import annotations
 
 import difflib
-import inspect
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import Field, dataclass, field, fields, replace
-from enum import StrEnum
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from geodiff_plugin._checks import (
-    bad_type,
-    bad_value,
-    check_choice,
-    check_flag,
-    check_number,
-    check_range,
-    number_text,
-    warn,
-)
-from geodiff_plugin.messages import Message
+from geodiff_plugin._internal.checks import bad_type, bad_value, check_number, check_range, warn
+from geodiff_plugin.findings import Finding
+from geodiff_plugin.settings import Affects, setting, settings_of
 
-#: Weights of the default preset.
-DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
-#: The least value where 0 is not allowed.
+#: Loss weights of the default preset.
+DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "affine_reg": 0.01, "anchor": 1.0}
+#: Minimum of a number that must be positive.
 TINY = 1e-9
-
-
-class Affects(StrEnum):
-    """What becomes stale with another value of a setting, as every field of settings declares."""
-
-    NOTHING = "nothing"  # of what is stored, or only its rounding
-    INPUTS = "inputs"  # through the files that it names, which count by their content
-    POSES = "poses"  # of a capture, and every result made with them
-    EVIDENCE = "evidence"  # what act 1 finds in the views, and every result made from it
-    RESULT = "result"
-
-
 EVIDENCE, RESULT = Affects.EVIDENCE, Affects.RESULT
 
 
-def affected(described: Field[Any]) -> Affects | None:
-    """What a field declares that it affects; ``None`` if it declares nothing."""
-    return described.metadata.get("affects")
-
-
 class _FrozenDict(dict[str, Any]):
-    """A dict that cannot be changed, so that a configuration can hold it; equal to a dict of its items."""
+    """An immutable dict that compares equal to a dict with the same items."""
 
-    def _refuse(self, *_: Any, **__: Any) -> Any:
-        raise TypeError("a configuration does not change; make another one with changed(...)")
+    def _forbid(self, *_: Any, **__: Any) -> Any:
+        raise TypeError("a configuration is immutable; create another one with changed(...)")
 
-    __setitem__ = __delitem__ = __ior__ = clear = pop = popitem = setdefault = update = _refuse
+    __setitem__ = __delitem__ = __ior__ = clear = pop = popitem = setdefault = update = _forbid
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(frozenset(self.items()))
@@ -66,248 +42,334 @@ class _FrozenDict(dict[str, Any]):
         return _FrozenDict, (dict(self),)
 
 
-def _knob(
-    default: Any,
-    values: str,
-    check: Callable[[Any, str], Any],
-    *,
-    affects: Affects,
-    paper: str = "{}",
-    unset: str = "",
-) -> Any:
-    """A field with what is known about it beside the sentence on what it does.
-
-    ``values`` are its range in words; ``check`` gives the value as it is kept; ``paper`` is what the paper
-    says of it, with ``"{}"`` for the value of ``PAPER``; ``unset`` what ``None`` becomes, empty for no value.
-    """
-
-    def checked(value: Any, name: str) -> Any:
-        return None if unset and value is None else check(value, name)
-
-    values += ", or `None`" if unset else ""
-    metadata = {"values": values, "check": checked, "paper": paper, "unset": unset, "affects": affects}
-    return field(default=default, metadata=metadata)
-
-
-def _number(default: float | None, low: float, high: float, kind: type = float, **more: Any) -> Any:
-    """A finite number in ``[low, high]``, or a whole one."""
-    whole = kind is int
-    values = f"{'integer, ' * whole}[{number_text(low)}, {number_text(high)}]"
-    return _knob(
-        default, values, lambda v, name: kind(check_number(v, name, low, high, integer=whole)), **more
-    )
-
-
-def _flag(default: bool, **more: Any) -> Any:
-    return _knob(default, "bool", check_flag, **more)
-
-
-def _choice(*choices: str, **more: Any) -> Any:
-    """One of some names, the default first."""
-    values = ", ".join(f"`{name}`" for name in choices)
-    return _knob(choices[0], values, lambda v, name: check_choice(v, name, choices), **more)
-
-
-def _text(default: str, values: str, **more: Any) -> Any:
-    """A text that is not empty; only the code that uses it can say whether the text is valid."""
+def _text(values: str) -> dict[str, Any]:
+    """Rules for a non-empty string, whose validity only the code that uses it can check."""
 
     def check(value: Any, name: str) -> str:
         text = str(value) if isinstance(value, Path) else value
-        return text if isinstance(text, str) and text else bad_type(name, f"a text ({values})", value)
+        return text if isinstance(text, str) and text else bad_type(name, f"a string ({values})", value)
 
-    return _knob(default, values, check, **more)
-
-
-def _pair(default: tuple[float, float] | None, **more: Any) -> Any:
-    """Two numbers in metres, ``0 < low < high``; a list is taken for a tuple."""
-    return _knob(default, "pair with 0 < low < high, m", check_range, **more)
+    return {"own_check": check, "own_values": values}
 
 
 def _mapping(value: Any, name: str) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else bad_type(name, "a dict of values by name", value)
+    return value if isinstance(value, Mapping) else bad_type(name, "a dict that maps names to values", value)
 
 
-def _weights(default: Mapping[str, float]) -> Any:
-    """A dict of weights >= 0 by the name of a term."""
+def _check_weights(value: Any, name: str) -> _FrozenDict:
+    """Check a dict that maps names of loss terms to weights >= 0."""
+    weights = {}
+    for key, weight in _mapping(value, name).items():
+        if not isinstance(key, str):
+            bad_value(f"a key of {name}", "a string", repr(key))
+        weights[key] = float(check_number(weight, f"{name}[{key!r}]", 0.0, float("inf")))
+    return _FrozenDict(weights)
 
-    def check(value: Any, name: str) -> _FrozenDict:
-        weights = {}
-        for key, weight in _mapping(value, name).items():
-            if not isinstance(key, str):
-                bad_value(f"a key of {name}", "a text", repr(key))
-            weights[key] = float(check_number(weight, f"{name}[{key!r}]", 0.0, float("inf")))
-        return _FrozenDict(weights)
 
-    return _knob(_FrozenDict(default), "term -> >= 0", check, affects=RESULT)
+#: Rules for a pair of numbers in metres; a list is converted to a tuple.
+_PAIR: dict[str, Any] = {"own_check": check_range, "own_values": "pair with 0 < low < high, m"}
+# The sections of the tables, in order.
+_call, _term, _search, _fit, _update = (
+    partial(setting, section=section, affects=RESULT)
+    for section in (
+        "Call",
+        "Loss terms",
+        "Plane sweep and scale search (S7.3)",
+        "Match fitting",
+        "Gradient updates (Algorithm 1)",
+    )
+)
 
 
 class UpdatePlan(NamedTuple):
-    """Gradient updates of a call: ``inner_steps`` in each denoising step that makes any.
+    """Gradient updates of a call: ``guidance_steps`` per denoising step.
 
-    Steps that end by the fraction ``updates_from`` of the schedule make none.
+    Denoising steps that end before the fraction ``updates_from`` of the schedule make no updates.
     """
 
-    inner_steps: int
+    guidance_steps: int
     updates_from: float
-    step_latents: float
+    lr_latents: float
 
 
 @dataclass(frozen=True)
 class GuidanceConfig:
-    """How strongly, and by what, a second view steers the diffusion; with no argument the default preset.
-
-    The tables of knobs take their sentences from here.
-
-    Attributes:
-        gradient: `full` goes through the U-Net to z_t; `denoised` stops at the clean latent and moves that.
-        weights: the terms of the loss; a term of weight 0 costs nothing (gamma of Eq. 17 is `prior_pull`).
-        min_steps: denoising steps when the call names none and the pipeline's default is lower.
-        respace: a leading DDIM schedule runs as trailing while guided.
-        sweep_pixels: upper bound on the pixels of the grid of matches, corrections and losses.
-        depth_range: bounds of the sweep and of the nearest and farthest depth of the search.
-        pose: poses that do not fit the matches are refined ([poses](../how-to/poses.md#given-poses)).
-        clean_photographs: JPEG blocks and strong sensor noise are removed before photographs are compared;
-            the prior sees the image as it is, except that `--distortion` undistorts cleaned ones.
-        decoder: what decodes and encodes latents ([priors](../reference/priors.md#a-tiny-decoder)).
-        eta: SSIM against L1 in the photometric term (Eq. 14).
-        pyramid_levels: levels of the image pyramid of the photometric term.
-        exposure: photographs are compared in the left one's exposure: gain, bias and a slow field.
-        z_test: pixels that the estimate occludes in a right view do not count in the photometric term.
-        min_visible: share in view below which the photometric term is off.
-        pull_to: what `prior_pull` pulls s_hat, t_hat towards (Eq. 17): the search's result, or 0.
-        points_loss: at points: Cauchy in inverse depth over 1 % of the points' median, or L1 + L2 in metres.
-        planes: upper bound on the number of planes of the sweep.
-        search: joint (near, far) in the cost volume, then the basin that reliable matches prefer (a robust
-            fit to the points without a right view); the argmin over g_s (S7.3); or the nearest and the
-            farthest point (Marigold-DC).
-        positive: how raw scale and shift become positive (Eq. 13); `square` also clips the map to [0, 1].
-        g_s_range: candidates of the one-number search; the paper says "a predefined depth range" (S7.3).
-        g_s_candidates: the number of these candidates.
-        reject_reflections: regions of matches behind the first decoded estimate count as reflections.
-        correct: the decoded map is fitted to its matches and points and the change is encoded, before the
-            updates, unless these go through the network (SteeredMarigold, Gregorek and Nalpantidis 2024).
-        corrections: upper bound on the number of steps (or rounds of a one-step prior) that are corrected:
-            the last, and the others spread over the second half of the schedule where they fit.
-        even_ensemble: median of an even number of members: mean of the middle two, or the lower of them.
-        ensemble_at: size at which members become one map: the processing size, or the image's (Marigold-DC).
-        crisp: the result is finished at full resolution
-            ([dataflow](../explanation/dataflow.md#how-edges-become-crisp)).
-        smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
-            long, for a prior that is wrong by 5 %; it falls with the fourth power of that error.
-        match_noise: relative error of a perfect match.
-        outlier_width: standard deviations from its region beyond which a match counts for less.
-        rule: how a gradient moves the latent, scale and shift: `plain`; `summed`, plain, but the latent
-            follows the loss times the number of pixels; `adam`; `adam-norm`, Adam on the gradient scaled to
-            the noise's norm (Marigold-DC).
-        step_latents: step size of `rule` on the latent.
-        step_affine: step size of `rule` on raw s_hat, t_hat.
-        inner_steps: updates in a denoising step; after a correction only the last quarter of steps makes any.
-        optimize_latents: `False` is Table 4's ablation: scale and shift only (S5.3).
-        start: fraction of the schedule before which nothing is updated.
-        stop: fraction after which nothing is updated.
-        step_from: with `gradient="full"`: add the update after the scheduler's step (Algorithm 1), or let the
-            step start from the updated z_t (Marigold-DC).
+    """Parameters of guidance by a second view. Without arguments this is the default preset.
 
     Raises:
-        InputError: a value of the wrong type or out of range, naming the knob.
+        InputError: A value has the wrong type or is out of range. The message names the parameter.
     """
 
-    gradient: str = _choice("denoised", "full", affects=RESULT)
-    weights: Mapping[str, float] = _weights(DEFAULT_WEIGHTS)
-    min_steps: int = _number(4, 1, 1000, int, affects=RESULT, paper="{}, not given")
-    respace: bool = _flag(True, affects=RESULT)
-    sweep_pixels: int = _number(210_000, 1024, 1 << 32, int, affects=EVIDENCE, paper="{} (768 px, S9)")
-    depth_range: tuple[float, float] | None = _pair(
-        None, affects=EVIDENCE, paper="-", unset="from the nearest plane to a shift of 0.3 px"
+    gradient: str = _call(
+        "denoised",
+        "What the gradient updates: `denoised`, the predicted clean latent (no gradient through the U-Net), "
+        "or `full`, z_t (gradient through the U-Net)",
+        choices=("denoised", "full"),
     )
-    pose: str = _choice("refine", "given", affects=EVIDENCE)
-    clean_photographs: bool = _flag(True, affects=EVIDENCE)
-    decoder: str = _text("full", "`full`, `tiny`, a folder or a hub id", affects=RESULT, paper="-")
-    eta: float = _number(0.85, 0, 1, affects=RESULT, paper="{}, not given")
-    pyramid_levels: int = _number(3, 1, 10, int, affects=RESULT)
-    exposure: bool = _flag(True, affects=RESULT)
-    z_test: bool = _flag(True, affects=RESULT)
-    min_visible: float = _number(0.1, 0, 1, affects=RESULT)
-    pull_to: str = _choice("start", "zero", affects=RESULT)
-    points_loss: str = _choice("robust", "l1l2", affects=RESULT, paper="-")
-    planes: int = _number(160, 24, 4096, int, affects=EVIDENCE, paper="-")
-    search: str = _choice("volume", "one-number", "points-range", affects=EVIDENCE)
-    positive: str = _choice("softplus", "square", affects=RESULT)
-    g_s_range: tuple[float, float] = _pair((1.0, 80.0), affects=RESULT, paper="{}, not given")
-    g_s_candidates: int = _number(80, 2, 100_000, int, affects=RESULT, paper="{}, not given")
-    reject_reflections: bool = _flag(True, affects=RESULT)
-    correct: bool = _flag(True, affects=RESULT)
-    corrections: int = _number(2, 1, 10_000, int, affects=RESULT, paper="-")
-    even_ensemble: str = _choice("mean", "lower", affects=RESULT, paper="-")
-    ensemble_at: str = _choice("processing", "image", affects=RESULT, paper="-")
-    crisp: bool = _flag(True, affects=EVIDENCE)
-    smoothness: float = _number(40.0, TINY, 1e6, affects=RESULT, paper="-")
-    match_noise: float = _number(0.02, TINY, 1e3, affects=RESULT, paper="-")
-    outlier_width: float = _number(3.0, TINY, 1e6, affects=RESULT, paper="-")
-    rule: str = _text("adam", "key of `RULES`", affects=RESULT)
-    step_latents: float | None = _number(
-        None, 0, 1e6, affects=RESULT, unset="0.03 after a correction, else 0.1"
+    weights: Mapping[str, float] = _call(
+        _FrozenDict(DEFAULT_WEIGHTS),
+        "Weights of the loss terms; a term with weight 0 is not computed (gamma of Eq. 17 is `affine_reg`)",
+        own_check=_check_weights,
+        own_values="term -> >= 0",
     )
-    step_affine: float = _number(0.01, 0, 1e6, affects=RESULT)
-    inner_steps: int | None = _number(
-        None, 0, 10_000, int, affects=RESULT, unset="0 after a correction, else 40"
+    min_steps: int = _call(
+        4,
+        "Minimum number of denoising steps when the call sets none and the pipeline's default is lower",
+        low=1,
+        high=1000,
+        paper="{}, not given",
     )
-    optimize_latents: bool = _flag(True, affects=RESULT)
-    start: float = _number(0.0, 0, 1, affects=RESULT)
-    stop: float = _number(1.0, 0, 1, affects=RESULT)
-    step_from: str = _choice("given", "updated", affects=RESULT)
+    trailing_spacing: bool = _call(True, "Whether to run a leading DDIM schedule as trailing during guidance")
+    sweep_pixels: int = _call(
+        210_000,
+        "Maximum number of pixels of the grid on which matches, match fitting and losses are computed",
+        low=1024,
+        high=1 << 32,
+        affects=EVIDENCE,
+        paper="{} (768 px, S9)",
+    )
+    depth_range: tuple[float, float] | None = _call(
+        None,
+        "Nearest and farthest depth of the plane sweep and of the scale search",
+        **_PAIR,
+        affects=EVIDENCE,
+        paper="-",
+        unset="from the nearest plane to a disparity of 0.3 px",
+    )
+    pose: str = _call(
+        "refine",
+        "Whether to `refine` poses that do not fit the matches, or to use them as `given` "
+        "([poses](../how-to/poses.md))",
+        choices=("refine", "given"),
+        affects=EVIDENCE,
+    )
+    clean_images: bool = _call(
+        True,
+        "Whether to remove JPEG blocks and strong sensor noise before images are compared. The prior gets "
+        "the original image; with `--distortion` it gets the cleaned and undistorted image",
+        affects=EVIDENCE,
+    )
+    decoder: str = _call(
+        "full",
+        "Autoencoder for latents ([priors](../reference/priors.md))",
+        **_text("`full`, `tiny`, a folder or a hub id"),
+        paper="-",
+    )
+    ssim_weight: float = _term(
+        0.85,
+        "Weight of SSIM relative to L1 in the photometric term (Eq. 14)",
+        low=0,
+        high=1,
+        paper="{}, not given",
+    )
+    pyramid_levels: int = _term(3, "Number of image pyramid levels of the photometric term", low=1, high=10)
+    exposure: bool = _term(
+        True,
+        "Whether to match the right images' exposure to the left image (gain, bias and a smooth field) in "
+        "the photometric term",
+    )
+    occlusion_mask: bool = _term(
+        True, "Whether to exclude pixels that are occluded in a right view from the photometric term"
+    )
+    min_visible: float = _term(
+        0.1, "Visible fraction of the image below which the photometric term is off", low=0, high=1
+    )
+    affine_reg_target: str = _term(
+        "search",
+        "Target of the regularization `affine_reg` of s_hat and t_hat (Eq. 17): the result of the scale "
+        "search, or zero",
+        choices=("search", "zero"),
+    )
+    points_loss: str = _term(
+        "robust",
+        "Loss at known points: `robust` (Cauchy in inverse depth, scaled by 1 % of the points' median) or "
+        "`l1l2` (L1 + L2 in metres)",
+        choices=("robust", "l1l2"),
+        paper="-",
+    )
+    planes: int = _search(
+        160,
+        "Maximum number of planes of the sweep",
+        low=24,
+        high=4096,
+        affects=EVIDENCE,
+        paper="-",
+    )
+    search: str = _search(
+        "volume",
+        "How to search the scale: `volume` (joint near and far depth in the cost volume, then the basin "
+        "that reliable matches prefer; without a right view a robust fit to the points), `one-number` "
+        "(argmin over g_s, S7.3) or `points-range` (nearest and farthest point, Marigold-DC)",
+        choices=("volume", "one-number", "points-range"),
+        affects=EVIDENCE,
+    )
+    positive: str = _search(
+        "softplus",
+        "How raw scale and shift are mapped to positive values (Eq. 13); `square` also clips the map to [0, "
+        "1]",
+        choices=("softplus", "square"),
+    )
+    g_s_range: tuple[float, float] = _search(
+        (1.0, 80.0),
+        'Range of g_s in the `one-number` search; the paper states "a predefined depth range" (S7.3)',
+        **_PAIR,
+        paper="{}, not given",
+    )
+    g_s_candidates: int = _search(
+        80,
+        "Number of candidates in the `one-number` search",
+        low=2,
+        high=100_000,
+        paper="{}, not given",
+    )
+    reject_reflections: bool = _fit(
+        True, "Whether to reject regions of matches behind the first decoded estimate as reflections"
+    )
+    fit_matches: bool = _fit(
+        True,
+        "Whether to fit the decoded map to matches and points and to encode the change before gradient "
+        "updates. Ignored if gradients pass through the network (SteeredMarigold, Gregorek and Nalpantidis "
+        "2024)",
+    )
+    match_fits: int = _fit(
+        2,
+        "Maximum number of denoising steps (or rounds of a one-step prior) with match fitting: the last one, "
+        "and the others spread over the second half of the schedule",
+        low=1,
+        high=10_000,
+        paper="-",
+    )
+    even_ensemble: str = _fit(
+        "mean",
+        "How to take the median of an even number of members: the mean or the lower of the middle two",
+        choices=("mean", "lower"),
+        paper="-",
+    )
+    ensemble_at: str = _fit(
+        "processing",
+        "Size at which members are merged: the processing size, or the image size (Marigold-DC)",
+        choices=("processing", "image"),
+        paper="-",
+    )
+    refine_edges: bool = _fit(
+        True,
+        "the result is finished at full resolution "
+        "([architecture](../explanation/architecture.md#edge-refinement))",
+        affects=EVIDENCE,
+    )
+    smoothness: float = _fit(
+        40.0,
+        "Smoothness weight of match fitting relative to a match of full confidence, for a grid of 512 pixels "
+        "and a prior with 5 % error; it decreases with the fourth power of that error",
+        low=TINY,
+        high=1e6,
+        paper="-",
+    )
+    match_sigma: float = _fit(
+        0.02, "Relative standard deviation of a perfect match", low=TINY, high=1e3, paper="-"
+    )
+    outlier_sigma: float = _fit(
+        3.0,
+        "Number of standard deviations from its region beyond which a match is down-weighted",
+        low=TINY,
+        high=1e6,
+        paper="-",
+    )
+    optimizer: str = _update(
+        "adam",
+        "Optimizer of latent, scale and shift: `plain` gradient descent, `summed` (plain, but the latent's "
+        "loss is multiplied by the number of pixels), `adam`, or `adam-norm` (Adam on the gradient scaled "
+        "to the norm of the noise, Marigold-DC)",
+        **_text("name of an optimizer"),
+    )
+    lr_latents: float | None = _update(
+        None,
+        "Learning rate of the latent",
+        low=0,
+        high=1e6,
+        unset="0.03 after match fitting, else 0.1",
+    )
+    lr_affine: float = _update(0.01, "Learning rate of raw s_hat and t_hat", low=0, high=1e6)
+    guidance_steps: int | None = _update(
+        None,
+        "Number of gradient updates per denoising step; after match fitting only the last quarter of the "
+        "steps makes updates",
+        low=0,
+        high=10_000,
+        unset="0 after match fitting, else 40",
+    )
+    optimize_latents: bool = _update(
+        True, "Whether to update the latent; `False` updates only scale and shift (ablation in Table 4, S5.3)"
+    )
+    guidance_start: float = _update(
+        0.0, "Fraction of the schedule at which gradient updates start", low=0, high=1
+    )
+    guidance_end: float = _update(
+        1.0, "Fraction of the schedule at which gradient updates end", low=0, high=1
+    )
+    step_from: str = _update(
+        "given",
+        'With `gradient="full"`: whether to add the update after the scheduler step (`given`, Algorithm 1) '
+        "or to start the scheduler step from the `updated` z_t (Marigold-DC)",
+        choices=("given", "updated"),
+    )
 
     def __post_init__(self) -> None:
-        for described in fields(self):
-            value = described.metadata["check"](getattr(self, described.name), described.name)
-            object.__setattr__(self, described.name, value)
-        check_number(self.start, "start", 0.0, self.stop)
+        for name, parameter in settings_of(type(self)).items():
+            object.__setattr__(self, name, parameter.check(getattr(self, name), name))
+        check_number(self.guidance_start, "guidance_start", 0.0, self.guidance_end)
 
     def plan_updates(self, points_given: bool) -> UpdatePlan:
-        """The updates of a call, with points or without; what is left open depends on the other knobs."""
-        # Matches and points that can be encoded bring the latent close; else the gradient has the whole way.
+        """Resolve the automatic parameters of gradient updates for a call with or without points."""
+        # Fitting matches or points brings the latent close to its target, so few small updates suffice.
         encoded = self.weights.get("matches") or (self.weights.get("points") and points_given)
-        near = self.correct and encoded and self.optimize_latents and self.gradient == "denoised"
-        # Early estimates are left to the matches; late ones are refined by the photographs.
-        steps, start, size = (0, 0.75 * self.stop, 0.03) if near else (40, 0.0, 0.1)
+        near = self.fit_matches and encoded and self.optimize_latents and self.gradient == "denoised"
+        # Early steps rely on the matches, and late steps refine the estimate with the images.
+        steps, start, size = (0, 0.75 * self.guidance_end, 0.03) if near else (40, 0.0, 0.1)
         return UpdatePlan(
-            steps if self.inner_steps is None else self.inner_steps,
+            steps if self.guidance_steps is None else self.guidance_steps,
             start,
-            size if self.step_latents is None else self.step_latents,
+            size if self.lr_latents is None else self.lr_latents,
         )
 
     def needs_matches(self, points_given: bool) -> bool:
-        """Whether a call uses matches of its views: they have a weight, and something is moved by it."""
-        moved = self.correct or self.crisp or self.plan_updates(points_given).inner_steps > 0
-        return moved and bool(self.weights.get("matches"))
+        """Whether a call uses matches: their weight is above 0, and fitting, refinement or updates are on."""
+        used = self.fit_matches or self.refine_edges or self.plan_updates(points_given).guidance_steps > 0
+        return used and bool(self.weights.get("matches"))
 
-    def changed(self, **knobs: Any) -> Self:
-        """This configuration with some knobs set otherwise; ``InputError`` for no such knob, or its value."""
-        for name in knobs:
-            if name not in KNOBS:
-                bad_value("a knob", "one that exists", repr(name), close_names(name, KNOBS))
-        return replace(self, **knobs)
+    def changed(self, **parameters: Any) -> Self:
+        """Return a copy with other parameter values; ``InputError`` for an unknown name or a bad value."""
+        for name in parameters:
+            if name not in PARAMETERS:
+                bad_value("a parameter", "an existing one", repr(name), close_names(name, PARAMETERS))
+        return replace(self, **parameters)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values by knob; inverse of ``from_dict``."""
-        values = {name: getattr(self, name) for name in KNOBS}
+        """Return the parameters as JSON values; inverse of ``from_dict``."""
+        values = {name: getattr(self, name) for name in PARAMETERS}
         return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()} | {
             "weights": dict(self.weights)
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """What ``to_dict`` gave, also in former versions; what is missing is as in the default.
+        """Create a configuration from the output of ``to_dict``, also from earlier versions.
 
-        A warning names what is no knob any more. ``InputError`` for a value, or a knob that is misspelt.
+        Missing parameters have their default. A warning lists unknown parameters, which are ignored.
+        ``InputError`` for a bad value or a misspelt parameter.
         """
         flat: dict[str, Any] = {}
         for name, value in _mapping(values, "the configuration").items():
-            is_stage = name not in KNOBS and isinstance(value, Mapping)
+            is_stage = name not in PARAMETERS and isinstance(value, Mapping)
             flat |= value if is_stage else {name: value}
-        known = {n: v for n, v in flat.items() if n in KNOBS or difflib.get_close_matches(n, KNOBS, 1, 0.85)}
-        if gone := [name for name in flat if name not in known]:
-            warn(Message("config.former-knobs", f"No longer knobs, and left out: {', '.join(gone)}."))
+        known = {
+            n: v
+            for n, v in flat.items()
+            if n in PARAMETERS or difflib.get_close_matches(n, PARAMETERS, 1, 0.85)
+        }
+        if unknown := [name for name in flat if name not in known]:
+            message = f"Unknown parameters are ignored: {', '.join(unknown)}. Save the configuration again."
+            warn(Finding("config.unknown-parameters", message))
         return cls().changed(**known)
 
     def save(self, path: str | Path) -> None:
@@ -316,60 +378,67 @@ class GuidanceConfig:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what ``save`` wrote; ``InputError`` as ``from_dict``."""
+        """Read a file written by ``save``; ``InputError`` as in ``from_dict``."""
         try:
             values = json.loads(Path(path).read_text(encoding="utf-8"))
         except ValueError as error:
-            bad_value(f"the configuration {path}", "a JSON file that GuidanceConfig.save wrote", str(error))
+            bad_value(f"the configuration {path}", "a JSON file written by GuidanceConfig.save", str(error))
         return cls.from_dict(values)
 
 
-#: All knobs, in the order of the tables.
-KNOBS = tuple(described.name for described in fields(GuidanceConfig))
+#: All parameters by name, in the order of the tables.
+PARAMETERS = settings_of(GuidanceConfig)
+# The docstring lists all parameters for ``help(GuidanceConfig)``.
+_ATTRIBUTES = "".join(f"        {name}: {parameter.help}.\n" for name, parameter in PARAMETERS.items())
+GuidanceConfig.__doc__ = (GuidanceConfig.__doc__ or "").replace(
+    "    Raises:", f"    Attributes:\n{_ATTRIBUTES}\n    Raises:"
+)
 
 DEFAULT = GuidanceConfig()
 
-#: Algorithm 1 with its printed numbers; docs/reference/paper-map.md settles what the paper leaves open.
+#: Algorithm 1 with its printed numbers; docs/explanation/method.md settles what the paper leaves open.
 PAPER = DEFAULT.changed(
     gradient="full",
-    rule="summed",
-    step_latents=1e-2,
-    step_affine=1e-2,
-    inner_steps=1,
+    optimizer="summed",
+    lr_latents=1e-2,
+    lr_affine=1e-2,
+    guidance_steps=1,
     min_steps=10,
-    weights={"photometric": 1.0, "prior_pull": 0.01},
-    eta=0.85,
+    weights={"photometric": 1.0, "affine_reg": 0.01},
+    ssim_weight=0.85,
     pyramid_levels=1,
     exposure=False,
-    z_test=False,
+    occlusion_mask=False,
     min_visible=0.0,
-    pull_to="zero",
+    affine_reg_target="zero",
     search="one-number",
     sweep_pixels=768 * 576,
     pose="given",
-    clean_photographs=False,
-    correct=False,
+    clean_images=False,
+    fit_matches=False,
     reject_reflections=False,
-    crisp=False,
+    refine_edges=False,
 )
 
-#: For rigs and videos: coarser matches, a fit at the end alone, the rig's pose as it is.
-FAST = DEFAULT.changed(sweep_pixels=80_000, corrections=1, min_steps=1, pose="given")
+#: For rigs and videos: coarser matches, one match fit at the end, and the given pose.
+FAST = DEFAULT.changed(sweep_pixels=80_000, match_fits=1, min_steps=1, pose="given")
 
-#: Scale and shift of the search alone.
-SEARCH_ONLY = DEFAULT.changed(inner_steps=0, weights={"photometric": 1.0}, correct=False, crisp=False)
+#: Only the scale and shift from the search.
+SEARCH_ONLY = DEFAULT.changed(
+    guidance_steps=0, weights={"photometric": 1.0}, fit_matches=False, refine_edges=False
+)
 
-#: A plain call that is fitted to the matches and refined once: the default without its loop.
-PRIOR_FIT = DEFAULT.changed(inner_steps=0, correct=False)
+#: A plain call, followed by one match fit and edge refinement: the default without its guidance loop.
+PRIOR_FIT = DEFAULT.changed(guidance_steps=0, fit_matches=False)
 
 #: Marigold-DC (Viola et al. 2024, "Marigold-DC: zero-shot monocular depth completion with guided diffusion")
-#: with the numbers of its code, whose loss is taken at the image's own resolution: no bound on it.
+#: with the numbers of its code. Its loss is computed at the image resolution, so the grid is unbounded.
 MARIGOLD_DC = DEFAULT.changed(
     gradient="full",
-    rule="adam-norm",
-    step_latents=0.05,
-    step_affine=0.005,
-    inner_steps=1,
+    optimizer="adam-norm",
+    lr_latents=0.05,
+    lr_affine=0.005,
+    guidance_steps=1,
     min_steps=50,
     weights={"points": 1.0},
     points_loss="l1l2",
@@ -379,11 +448,11 @@ MARIGOLD_DC = DEFAULT.changed(
     even_ensemble="lower",
     ensemble_at="image",
     sweep_pixels=1 << 32,
-    correct=False,
-    crisp=False,
+    fit_matches=False,
+    refine_edges=False,
 )
 
-#: All presets by name; ``geodiff depth --preset`` takes the first three.
+#: All presets by name. ``geodiff depth --preset`` accepts the first three.
 PRESETS = {
     "default": DEFAULT,
     "fast": FAST,
@@ -395,68 +464,51 @@ PRESETS = {
 
 
 def close_names(name: str, names: Iterable[str]) -> str:
-    """Names that exist, those that look like ``name`` first, as a sentence."""
+    """Suggest existing names similar to ``name``, then list all names."""
     names = list(names)
     *others, last = difflib.get_close_matches(name, names, 3, 0.6) or [""]
     hint = f"Did you mean {', '.join(others)}{' or ' * bool(others)}{last}? " if last else ""
-    return f"{hint}There are: {', '.join(names)}."
+    return f"{hint}Available: {', '.join(names)}."
 
 
 def config_from_text(entries: Iterable[str], base: GuidanceConfig, name: str) -> GuidanceConfig:
-    """``base`` with knobs set otherwise, ``KNOB=VALUE`` each, as typed behind the option ``name``.
+    """Return ``base`` changed by entries ``NAME=VALUE`` of the command-line option ``name``.
 
-    A value is JSON, or text where it is none; ``weights.TERM=VALUE`` changes one weight. ``InputError`` for
-    another form, a knob that does not exist, a value that it cannot have.
+    A value is parsed as JSON, or used as a string if it is not JSON. ``weights.TERM=VALUE`` changes one
+    weight. ``InputError`` for another form, an unknown parameter or a bad value.
     """
     changes: dict[str, Any] = {}
     for entry in entries:
         written, equals, text = entry.partition("=")
-        knob, _, term = written.partition(".")
-        if not equals or knob not in KNOBS or (knob == "weights") != bool(term):
-            cure = close_names(written, [*(n for n in KNOBS if n != "weights"), "weights.NAME"])
-            cure = f"Write {written}=VALUE." if knob in KNOBS and not equals else cure
-            bad_value(name, "KNOB=VALUE with a knob of GeometryGuidance", repr(entry), cure)
+        parameter, _, term = written.partition(".")
+        if not equals or parameter not in PARAMETERS or (parameter == "weights") != bool(term):
+            hint = close_names(written, [*(n for n in PARAMETERS if n != "weights"), "weights.NAME"])
+            hint = f"Write {written}=VALUE." if parameter in PARAMETERS and not equals else hint
+            bad_value(name, "NAME=VALUE with a guidance parameter", repr(entry), hint)
         try:
             value = json.loads(text)
         except (ValueError, RecursionError):
             value = text
-        changes[knob] = changes.get(knob, base.weights) | {term: value} if term else value
+        changes[parameter] = changes.get(parameter, base.weights) | {term: value} if term else value
     return base.changed(**changes)
 
 
 def value_of(name: str, config: GuidanceConfig) -> Any:
-    """A knob's value, or that of ``weights.TERM``; automatic choices as they are made with matches.
+    """Return the value of a parameter or of ``weights.TERM``, with automatic values resolved for matches.
 
-    ``InputError`` for no such knob, ``KeyError`` for no such term.
+    ``InputError`` for an unknown parameter, ``KeyError`` for an unknown term.
     """
-    knob, _, term = name.partition(".")
-    if knob not in KNOBS:
-        bad_value("a knob", "one that exists", repr(name), close_names(name, KNOBS))
-    value = getattr(config, knob)
+    parameter, _, term = name.partition(".")
+    if parameter not in PARAMETERS:
+        bad_value("a parameter", "an existing one", repr(name), close_names(name, PARAMETERS))
+    value = getattr(config, parameter)
     if term:
         return value[term]
-    return getattr(config.plan_updates(points_given=False), knob, None) if value is None else value
-
-
-#: Sections of the tables of knobs, by the first knob of each.
-SECTIONS = {
-    "gradient": "The call",
-    "eta": "Terms of the loss",
-    "planes": "Plane sweep and search of the scale (S7.3)",
-    "reject_reflections": "Correction by matches and points",
-    "rule": "Gradient updates of latent, scale and shift (Algorithm 1)",
-}
-
-
-def sentences() -> dict[str, str]:
-    """What every knob does, from the docstring of ``GuidanceConfig``."""
-    lines = inspect.cleandoc(GuidanceConfig.__doc__ or "").partition("Attributes:\n")[2]
-    entries = re.findall(r"^    (\w+): (.*(?:\n     +.*)*)", lines, re.MULTILINE)
-    return {name: " ".join(text.split()).rstrip(".") for name, text in entries}
+    return getattr(config.plan_updates(points_given=False), parameter, None) if value is None else value
 
 
 def shown(value: Any) -> str:
-    """A value of a knob as the tables show it."""
+    """Format a parameter value for the tables."""
     if isinstance(value, tuple):
         return f"({', '.join(map(shown, value))})"
     if isinstance(value, dict):
@@ -464,14 +516,15 @@ def shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def knob_lines() -> list[str]:
-    """For a terminal: the sections, and of every knob a line with its default, range and what it does."""
+def parameter_lines() -> list[str]:
+    """Format the sections and one line per parameter (default, range, help) for a terminal."""
     lines: list[str] = []
-    for described in fields(GuidanceConfig):
-        name, knob, value = described.name, described.metadata, getattr(DEFAULT, described.name)
-        lines += ["", SECTIONS[name]] if name in SECTIONS else []
-        # A terminal has no use for links and marks.
-        sentence = re.sub(r" \(\[[^]]*\]\([^)]*\)\)", "", sentences().get(name, ""))
-        default = knob["unset"] if value is None else shown(value)
-        lines.append(f"  {name} = {default}  [{knob['values']}]  {sentence}".replace("`", ""))
+    section = ""
+    for name, parameter in PARAMETERS.items():
+        lines += ["", parameter.section] if parameter.section != section else []
+        section = parameter.section
+        # Links and Markdown quotes are removed for the terminal.
+        sentence = re.sub(r" \(\[[^]]*\]\([^)]*\)\)", "", parameter.help)
+        default = parameter.unset if parameter.default is None else shown(parameter.default)
+        lines.append(f"  {name} = {default}  [{parameter.values}]  {sentence}".replace("`", ""))
     return lines[1:]

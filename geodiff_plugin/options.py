@@ -1,6 +1,9 @@
-"""An option is declared once, as a field of a dataclass, for command line, page, ComfyUI node and checks.
+"""Define the options that several commands, the web app and the ComfyUI node share, and check them.
 
-Nothing here imports torch: ``geodiff --help`` and what is wrong with an option are said at once.
+An option is a ``settings.setting`` field of a dataclass. Nothing here imports torch, so ``geodiff --help``
+and option errors are immediate.
+
+Layer 1: imports ``settings``; ``jobs``, ``evaluation``, ``app`` and ``cli`` import it.
 """
 
 from __future__ import annotations
@@ -8,35 +11,33 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Callable
-from dataclasses import Field, dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from geodiff_plugin._checks import bad_value, check_choice, check_number, check_positive, refuse
-from geodiff_plugin._lazy import imported
-from geodiff_plugin.config import Affects
+from geodiff_plugin._internal.checks import bad_value, raise_input_error
+from geodiff_plugin.settings import DEFAULT_SECTION, Affects, Setting, check_settings, setting, settings_of
 
 if TYPE_CHECKING:
     from geodiff_plugin.config import GuidanceConfig
 
-# Titles of the groups of options in ``--help``. Each group fits one screen.
+# Section headings in ``--help``. Each section fits on one screen.
 CAMERAS = "Cameras"
 SAMPLES = "Data and methods"
 OUTPUT = "Output"
 PRIOR = "Prior"
 GUIDANCE = "Guidance"
-UNKNOWN_POSES = "Photographs without poses"
-FURTHER_VIEWS = "Further views"
+UNKNOWN_POSES = "Images without poses"
+FURTHER_VIEWS = "Additional views"
 KNOWN_DEPTHS = "Known depths"
+MASKS = "Valid pixels"
 SEQUENCES = "Folders, videos and bags"
-MACHINES = "Many machines"
+MACHINES = "Distributed runs"
 SPEED = "Speed on a GPU"
-#: The group of an option that is in none of these, as typer calls it.
-OTHERS = "Options"
-#: The order of the groups: most used first.
-PANELS = (
-    OTHERS,
+#: The order of the sections: most used first.
+SECTIONS = (
+    DEFAULT_SECTION,
     CAMERAS,
     SAMPLES,
     OUTPUT,
@@ -45,233 +46,201 @@ PANELS = (
     UNKNOWN_POSES,
     FURTHER_VIEWS,
     KNOWN_DEPTHS,
+    MASKS,
     SEQUENCES,
     MACHINES,
     SPEED,
 )
 NOTHING, RESULT = Affects.NOTHING, Affects.RESULT
 DTYPES = ("float32", "float16", "bfloat16")
-#: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
+#: Keys of ``scale.space.SPACES``, which imports torch. A test keeps both in sync.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")
 PRESETS = ("default", "fast", "paper")
-#: What works on many items.
+#: Engines that process batches.
 ENGINES = ("local", "ray")
 
 
 class Command(NamedTuple):
-    """A command: its options (``None`` for a group, which ``run`` returns), its function and its help."""
+    """A command: its options (``None`` for a group that ``run`` returns), its function and its help."""
 
     options: type | None
     run: Callable[[Any], Any]
     about: str
 
 
-@dataclass(frozen=True)
-class OptionRules:
-    """What ``declare`` says of an option, beside the name, the type and the default of its field."""
+class Given(NamedTuple):
+    """A condition: the option is given, with this value unless it is ``None``."""
 
-    help: str
-    flags: tuple[str, ...]  # as typed; empty for ``--name-with-dashes``
-    panel: str  # its group in ``--help``
-    low: float | None  # least value of a number
-    high: float | None
-    above_0: str  # the unit of a number that is finite and above 0; empty for other options
-    choices: tuple[str, ...]  # empty for any value
-    split: bool  # whether a tuple is typed with commas; otherwise its option is repeated
-    metavar: str | None  # what it takes, in a word; ``None`` for the word of its type
+    name: str
+    value: str | None = None
 
-    @property
-    def is_argument(self) -> bool:
-        """Whether it is typed without a name."""
-        return self.flags == ("",)
+    def holds(self, options: Any) -> bool:
+        """Whether the condition holds for these options."""
+        value = getattr(options, self.name)
+        return bool(value != self._option(options).default if self.value is None else value == self.value)
 
+    def typed(self, options: Any) -> str:
+        """Return the option as typed on the command line."""
+        flag = self._option(options).flag
+        return flag if self.value is None else f"{flag} {self.value}"
 
-def rules_of(field: Field[Any]) -> OptionRules | None:
-    """The rules of an option; ``None`` for a field that ``declare`` did not make."""
-    return field.metadata.get("rules")
+    def _option(self, options: Any) -> Setting:
+        return settings_of(type(options))[self.name]
 
 
-def on_ray(name: str) -> Any:
-    """A function of ``jobs.cluster``; ``InputError`` where Ray is not installed."""
-    try:
-        return imported(f"jobs.cluster.{name}")
-    except ModuleNotFoundError as error:
-        if error.name not in ("ray", "pyarrow"):
-            raise
-        refuse("--engine ray needs Ray, which is not installed. Run: pip install 'geodiff-plugin[ray]'.")
+class Needs(NamedTuple):
+    """A rule: ``names`` require one of the other options."""
+
+    names: tuple[str, ...]
+    one_of: tuple[Given, ...]
+    reason: str = ""
+
+    def broken(self, options: Any) -> str:
+        """Describe the violation, to follow the option's name; empty if the rule holds."""
+        if any(other.holds(options) for other in self.one_of):
+            return ""
+        return f"needs {' or '.join(other.typed(options) for other in self.one_of)}"
 
 
-def declare(
-    default: Any,
-    help_text: str,
-    *flags: str,
-    panel: str = OTHERS,
-    low: float | None = None,
-    high: float | None = None,
-    above_0: str = "",
-    choices: tuple[str, ...] = (),
-    split: bool = False,
-    metavar: str | None = None,
-    affects: Affects | None = None,
-) -> Any:
-    """A field of a dataclass of options: its default, ``MISSING`` where it must be given, and its help.
+class Excludes(NamedTuple):
+    """A rule: ``names`` cannot be combined with another option."""
 
-    ``flags`` are as typed, where that is not ``--name-with-dashes``, ``""`` for an argument without a name. A
-    number lies between ``low`` and ``high``, or is finite and above 0, in the unit ``above_0``. A tuple is
-    typed with commas where ``split``, otherwise its option is repeated. ``affects`` decides whether what is
-    finished is kept when the value changes; commands that keep nothing need not declare it.
-    """
-    rules = OptionRules(help_text, flags, panel, low, high, above_0, choices, split, metavar)
-    return dataclasses.field(default=default, metadata={"rules": rules, "affects": affects})
+    names: tuple[str, ...]
+    other: Given
+    reason: str = ""
+
+    def broken(self, options: Any) -> str:
+        """Describe the violation, to follow the option's name; empty if the rule holds."""
+        return f"cannot be used with {self.other.typed(options)}" if self.other.holds(options) else ""
 
 
-def flag_of(field: Field[Any]) -> str:
-    """How an option is typed: ``--min-confidence``, or ``LEFT`` for an argument."""
-    rules = rules_of(field)
-    if rules is None or not rules.flags:
-        return f"--{field.name.replace('_', '-')}"
-    return field.name.upper() if rules.is_argument else rules.flags[0]
+def check_rules(options: Any, rules: Iterable[Needs | Excludes]) -> None:
+    """Raise an error for the first option that violates a rule. Options that the record lacks never do."""
+    known = settings_of(type(options))
+    for rule in rules:
+        given = [known[name].flag for name in rule.names if name in known and Given(name).holds(options)]
+        if given and (words := rule.broken(options)):
+            raise_input_error(f"{given[0]} {words}{': ' * bool(rule.reason)}{rule.reason}.")
 
 
-def help_of(name: str) -> str:
-    """The sentence that says what an option of ``RunOptions`` is."""
-    rules = rules_of(RunOptions.__dataclass_fields__[name])
-    assert rules is not None
-    return rules.help
-
-
-def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) -> None:
-    """Hold every value of a dataclass of options against what its field declares, if ``declare`` made it."""
-    for field in dataclasses.fields(options):
-        rules, value, name = rules_of(field), getattr(options, field.name), name_of(field)
-        if rules is None:
-            continue
-        for entry in value if isinstance(value, tuple) else (value,):
-            if entry is None:
-                continue
-            if rules.choices:
-                check_choice(entry, name, rules.choices)
-            if rules.low is not None:
-                assert rules.high is not None
-                check_number(entry, name, rules.low, rules.high, integer="int" in str(field.type))
-            if rules.above_0:
-                check_positive(entry, name, rules.above_0)
-
-
-def workers_option() -> Any:
-    """How many processes of Ray hold the prior."""
-    about = "With --engine ray: processes that hold the prior (default: as many as fit)."
-    return declare(None, about, low=1, high=10**6, panel=MACHINES, affects=NOTHING)
-
-
-def gpus_option() -> Any:
-    """GPUs of each process of Ray."""
-    about = "With --engine ray: GPUs of each process, also a fraction (default: 1 where there are any)."
-    return declare(None, about, low=0, high=64, panel=MACHINES, affects=NOTHING)
-
-
-def engine_option() -> Any:
-    """What works on many items."""
-    about = "local (this machine) or ray (Ray Data, on one machine or a cluster; extra 'ray')."
-    return declare("local", about, choices=ENGINES, panel=MACHINES, affects=NOTHING)
-
-
-def check_engine(options: Any) -> None:
-    """Refuse options of Ray without it, and shards with it."""
-    if options.engine == "ray" and getattr(options, "shard", None) is not None:
-        refuse("--shard cannot be used with --engine ray, which divides the work by itself.")
-    for name in ("workers", "gpus"):
-        if options.engine != "ray" and getattr(options, name) is not None:
-            refuse(f"--{name} needs --engine ray.")
-
-
-_prior = partial(declare, panel=PRIOR, affects=RESULT)
-_guidance = partial(declare, panel=GUIDANCE, affects=RESULT)
+_prior = partial(setting, section=PRIOR, affects=RESULT)
+_guidance = partial(setting, section=GUIDANCE, affects=RESULT)
+_speed, _machines = (partial(setting, section=section, affects=NOTHING) for section in (SPEED, MACHINES))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PriorOptions:
-    """Which prior runs, and where: what every command that runs one has in common."""
+    """The prior and the device: options of every command that runs a prior."""
 
     prior: str = _prior(
         "bundled",
-        "The prior: 'bundled', a hub id such as prs-eth/marigold-depth-v1-1, or a folder; KEY:FOLDER names "
-        "the adapter of a folder.",
+        "Depth prior: 'bundled', a hub id such as prs-eth/marigold-depth-v1-1, or a folder; KEY:FOLDER "
+        "selects the adapter for a folder.",
     )
     space: str | None = _prior(
         None,
-        f"What the prior's map is affine in, where its folder does not say: {', '.join(SPACES)}.",
+        f"Space in which the prior is affine-invariant: {', '.join(SPACES)} (default: from its config).",
         choices=SPACES,
     )
     steps: int | None = _prior(
-        None, "Denoising steps (default: the prior's own number, at least 4).", low=1, high=1000
+        None,
+        "Number of denoising steps (default: the prior's own number, at least 4).",
+        low=1,
+        high=1000,
     )
-    seed: int = _prior(0, "Seed of the noise.", low=0, high=2**63 - 1)
-    device: str = _prior("auto", "Where it runs: auto, cpu, cuda, cuda:N or mps.", affects=NOTHING)
+    seed: int = _prior(0, "Random seed of the noise.", low=0, high=2**63 - 1)
+    dtype: str = _prior("float32", "Precision of the prior: float32, float16 or bfloat16.", choices=DTYPES)
+    device: str = _prior("auto", "Device: auto, cpu, cuda, cuda:N or mps.", affects=NOTHING)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedOptions:
-    """How networks and stages run on a GPU; results are equal within rounding."""
+    """Options for running networks and stages on a GPU. Results are equal within rounding."""
 
-    graphs: bool = declare(
+    cuda_graphs: bool = _speed(
         False,
-        "Run the networks as CUDA graphs, with a faster group norm in half precision (for many pairs and "
-        "captures this is done anyway).",
-        panel=SPEED,
-        affects=NOTHING,
+        "Run the networks as CUDA graphs, with a faster group norm in half precision (always on for batches "
+        "and captures).",
     )
-    no_kernels: bool = declare(
-        False, "Run every stage in plain torch, without Triton kernels.", panel=SPEED, affects=NOTHING
+    no_triton: bool = _speed(False, "Run all stages in plain torch, without Triton kernels.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineOptions:
+    """Options for distributing a batch."""
+
+    engine: str = _machines(
+        "local",
+        "Where to run: local (this machine) or ray (Ray Data, one machine or a cluster; needs extra 'ray').",
+        choices=ENGINES,
     )
+    workers: int | None = _machines(
+        None,
+        "With --engine ray: number of workers, each with a copy of the prior (default: as many as fit).",
+        low=1,
+        high=10**6,
+    )
+    gpus: float | None = _machines(
+        None,
+        "With --engine ray: GPUs per worker, possibly fractional (default: 1 if there are GPUs).",
+        low=0,
+        high=64,
+    )
+
+
+RAY = Given("engine", "ray")
+MACHINE_RULES = (
+    Needs(("workers", "gpus"), (RAY,)),
+    Excludes(("shard",), RAY, "Ray distributes the work itself"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(PriorOptions):
-    """How it runs: what ``geodiff depth``, the page and the ComfyUI node have in common."""
+    """Run options that ``geodiff depth``, the web app and the ComfyUI node share."""
 
     option: tuple[str, ...] = _prior(
-        (), "An option of the prior as NAME=VALUE, such as domain=outdoor of GeoWizard; repeatable."
+        (), "Option of the prior as NAME=VALUE, such as domain=outdoor for GeoWizard; repeatable."
     )
     ensemble: int = _prior(
         1,
-        "Number of runs with different noise; the spread of two or more is the uncertainty.",
+        "Number of predictions with different noise; the spread of two or more is the uncertainty.",
         low=1,
         high=1000,
     )
     resolution: int | None = _prior(
         None,
-        "Longer side of the image for the prior, in pixels; 0 keeps its size (default: the prior's own).",
+        "Longer side of the prior's input in pixels; 0 keeps the image size (default: the prior's own).",
         low=0,
         high=8192,
     )
     near: float | None = _guidance(None, "Nearest depth to search, in metres.", above_0="metres")
     far: float | None = _guidance(None, "Farthest depth to search, in metres.", above_0="metres")
-    dtype: str = _prior(
-        "float32", "Number format of the prior: float32, float16 or bfloat16.", choices=DTYPES
-    )
     preset: str = _guidance(
         "default",
-        "default, fast (coarser matches, poses as given) or paper (Algorithm 1).",
+        "Preset: default, fast (coarser matches, given poses) or paper (Algorithm 1).",
         choices=PRESETS,
     )
-    knob: tuple[str, ...] = _guidance(
-        (), "A knob of the guidance, such as inner_steps=0; repeatable. geodiff info --knobs lists them."
+    parameter: tuple[str, ...] = _guidance(
+        (),
+        "Guidance parameter, such as guidance_steps=0; repeatable. geodiff info --parameters lists all.",
+        "--set",
+        metavar="NAME=VALUE",
     )
 
-    def check(self, name_of: Callable[[Field[Any]], str] = flag_of) -> None:
-        """Everything that can be said before a file is opened or torch is imported."""
-        check_options(self, name_of)
-        names = {field.name: name_of(field) for field in dataclasses.fields(self)}
+    def check(self, name_of: Callable[[Setting], str] = lambda option: option.flag) -> None:
+        """Check all options that can be checked before a file is opened or torch is imported."""
+        check_settings(self, name_of)
+        names = {name: name_of(option) for name, option in settings_of(type(self)).items()}
         if (self.near is None) != (self.far is None):
             missing, given = ("near", "far") if self.near is None else ("far", "near")
-            refuse(f"{names[given]} needs {names[missing]}. Give both, in metres.")
+            raise_input_error(f"{names[given]} needs {names[missing]}. Give both in metres.")
         if self.near is not None and self.far is not None and self.near >= self.far:
-            got, cure = f"{self.near:g} and {self.far:g}", "Both are metres from the camera."
-            bad_value(names["near"], f"less than {names['far']}", got, cure)
+            got, hint = f"{self.near:g} and {self.far:g}", "Both are depths in metres."
+            bad_value(names["near"], f"less than {names['far']}", got, hint)
         if self.resolution is not None and (self.resolution % 8 or 0 < self.resolution < 32):
-            cure = f"Try {max(32, round(self.resolution / 8) * 8)}."
-            bad_value(names["resolution"], "a multiple of 8 from 32 on, or 0", self.resolution, cure)
+            hint = f"Try {max(32, round(self.resolution / 8) * 8)}."
+            bad_value(names["resolution"], "0 or a multiple of 8, at least 32", self.resolution, hint)
         if not re.fullmatch(r"auto|cpu|mps|cuda(:\d{1,3})?", self.device):
             bad_value(names["device"], "auto, cpu, cuda, cuda:N or mps", repr(self.device))
         for entry in self.option:
@@ -279,23 +248,23 @@ class RunOptions(PriorOptions):
                 bad_value(names["option"], "NAME=VALUE, such as domain=outdoor", repr(entry))
 
     def config(self) -> GuidanceConfig:
-        """The preset with the range of depths and the knobs that were given; imports torch."""
+        """Return the preset with the given depth range and parameters; imports torch."""
         from geodiff_plugin.config import PRESETS as CONFIGS
         from geodiff_plugin.config import config_from_text
 
         base = CONFIGS[self.preset]
-        config = config_from_text(self.knob, base, "--knob")
+        config = config_from_text(self.parameter, base, "--set")
         if config.depth_range is not None:
-            refuse("Give depth_range as --near and --far, in metres, not as --knob.")
+            raise_input_error("depth_range cannot be set with --set. Use --near and --far, in metres.")
         if self.near is None or self.far is None:
             return config
-        # The paper's search is over one number, between the same two depths.
+        # The paper preset searches a single number within the same depth range.
         name = "depth_range" if self.preset != "paper" else "g_s_range"
         given = name == "g_s_range" and config.g_s_range != base.g_s_range
         return config if given else config.changed(**{name: (self.near, self.far)})
 
     def call(self) -> dict[str, Any]:
-        """Keywords of the pipeline's call, without its generator."""
+        """Return the keyword arguments of the pipeline call, without its generator."""
         return {
             **dict(entry.split("=", 1) for entry in self.option),
             "num_inference_steps": self.steps,
@@ -305,6 +274,6 @@ class RunOptions(PriorOptions):
         }
 
     def as_json(self) -> dict[str, Any]:
-        """The options as JSON can hold them."""
+        """Return the options as JSON values."""
         plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self), default=str))
         return plain

@@ -1,8 +1,8 @@
 """Samples for the commands of the evaluation, and their calls."""
 
 import numpy as np
+from click.testing import CliRunner
 from PIL import Image
-from typer.testing import CliRunner
 
 from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.formats import write_pfm

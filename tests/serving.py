@@ -24,7 +24,7 @@ def free_port() -> int:
 
 
 def write_plane(folder: Path, baseline_m: float = 0.12) -> tuple[Path, Path, Path, np.ndarray]:
-    """Photographs of a tilted plane 12 cm apart, a calibration that says so or not, and the true depth."""
+    """Images of a tilted plane 12 cm apart, a calibration that is correct or not, and the true depth."""
     pair = plane_pair(size=(96, 128), focal=120.0, baseline=0.12)
     left, right, calibration = (folder / name for name in ("left.png", "right.png", "K.txt"))
     Image.fromarray(pair.left).save(left)

@@ -11,8 +11,9 @@ from diffusers import UNet2DModel
 from PIL import Image
 
 from geodiff_plugin import load_prior
-from geodiff_plugin.algorithm.gradients import RULES
+from geodiff_plugin.algorithm.optimizers import OPTIMIZERS
 from geodiff_plugin.algorithm.terms import TERMS
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
 from geodiff_plugin.evaluation.metrics import align
@@ -22,18 +23,19 @@ from geodiff_plugin.priors import PRIORS
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.scale.points import fit_to_points
 from geodiff_plugin.scale.space import SPACES, MetricMap
+from geodiff_plugin.trust import FactSheet, ImagesStage
 from tests.tiny import guided_call, make_vae, quiet, seeded
 
 (PAGE,) = (Path(__file__).resolve().parents[1] / "docs").rglob("extending.md")
 #: Tables of the blocks that a reader takes alone, with all that they import.
-ALONE = ("TERMS", "SPACES", "RULES", "CALIBRATION_FORMATS", "DATASETS", "METHODS")
+ALONE = ("TERMS", "SPACES", "OPTIMIZERS", "CALIBRATION_FORMATS", "DATASETS", "METHODS")
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture
 def page():
     """The names that the page's blocks define, the tables with what they add; all as before afterwards."""
-    tables = (PRIORS, TERMS, RULES, SPACES, CALIBRATION_FORMATS, DATASETS, METHODS)
+    tables = (PRIORS, TERMS, OPTIMIZERS, SPACES, CALIBRATION_FORMATS, DATASETS, METHODS)
     before = [(table, dict(table)) for table in tables]
     names: dict = {}
     for block in BLOCKS:
@@ -59,6 +61,17 @@ def test_a_block_runs_in_a_file_of_its_own(page, table):
     assert not missing
 
 
+def test_the_capture_format_of_the_page_is_read(page, tmp_path):
+    Image.new("RGB", (640, 480)).save(tmp_path / "a.png")
+    pose = " ".join(map(str, np.eye(4).ravel()))
+    (tmp_path / "ink.txt").write_text(f"500 {pose} a.png\n500 {pose} b.png\n")
+    layout = page["read_ink_capture"](tmp_path)
+    first, second = layout.candidates
+    np.testing.assert_array_equal(first.frame.E, np.eye(4))
+    assert layout.unit == "m" and first.camera.K[0, 0] == 500 and second.problem
+    assert page["read_ink_capture"](tmp_path / "nowhere") is None
+
+
 def test_what_the_page_adds_works(page, textured_plane, tmp_path):
     torch.manual_seed(0)
     unet = UNet2DModel(
@@ -76,8 +89,8 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
     pipe = quiet(load_prior(tmp_path))
     assert isinstance(pipe, page["InkPipeline"])
     weights = {"photometric": 1.0, "far_pull": 0.1}
-    knobs = {"rule": "sign", "weights": weights, "inner_steps": 2, "min_steps": 2}
-    out = guided_call(pipe, textured_plane, knobs)
+    parameters = {"optimizer": "sign", "weights": weights, "guidance_steps": 2, "min_steps": 2}
+    out = guided_call(pipe, textured_plane, parameters)
     assert (out.prediction > 0).all() and np.isfinite(out.prediction).all()
     assert "far_pull" in out.history[0].terms and len(out.history) == 2
 
@@ -87,13 +100,13 @@ def test_a_space_is_known_to_map_fit_and_alignment(page):
     metric, near, far = MetricMap("cube_root"), torch.tensor([1.5]), torch.tensor([9.0])
     depth_m = metric(x, metric.from_range(near, far))
     torch.testing.assert_close(metric.range_of(metric.from_range(near, far)), (near, far), rtol=2e-3, atol=0)
-    K = torch.tensor([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
-    points, _ = points_to_matches(depth_m[0, 0], K, (24, 32), (24, 32))
+    left = Camera(np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]]), (32, 24))
+    points, _ = points_to_matches(depth_m[0, 0], left, (24, 32))
     found = fit_to_points(x, points, metric)
     assert ((metric(x, metric.from_range(*found)) - depth_m).abs() / depth_m).median() < 0.1
-    truth = depth_m[0, 0].numpy()
-    aligned = align(3 * np.cbrt(truth) + 1, truth, truth > 0, "cube_root")
-    np.testing.assert_allclose(aligned, truth, rtol=1e-5)
+    ground_truth = depth_m[0, 0].numpy()
+    aligned = align(3 * np.cbrt(ground_truth) + 1, ground_truth, ground_truth > 0, "cube_root")
+    np.testing.assert_allclose(aligned, ground_truth, rtol=1e-5)
 
 
 def test_a_format_a_data_set_and_a_method(page, textured_plane, tmp_path):
@@ -110,3 +123,11 @@ def test_a_format_a_data_set_and_a_method(page, textured_plane, tmp_path):
     assert sample.label == "ink/one" and sample.depth_m.shape == pair.depth_m.shape
     prediction = find_method("flat").run(sample, Settings(), PriorCache())
     assert (prediction.depth_m == 2.0).all()
+
+
+def test_the_check_of_the_page_reports_what_it_measures(page):
+    check = page["Darkness"]
+    grey = np.full((8, 8), 200, np.uint8)
+    for dark, codes in ((np.full_like(grey, 4), ["views.dark"]), (grey, [])):
+        facts = FactSheet({check: check.of_images(ImagesStage([grey, dark], [8, 8]))})
+        assert [finding.code for finding in check.findings(facts, ())] == codes

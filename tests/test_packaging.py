@@ -36,12 +36,12 @@ def test_start_is_light(code: str) -> None:
 def test_the_collector_leaves_out_what_a_command_imports() -> None:
     code = """
 import gc
-from geodiff_plugin._lazy import uncollected
-with uncollected():
+from geodiff_plugin._internal.lazy import gc_frozen
+with gc_frozen():
     during, imported = gc.isenabled(), [[] for _ in range(1000)]
 frozen = gc.get_freeze_count()
 assert not during and gc.isenabled() and frozen >= 1000
-with uncollected():  # what others made in between may be garbage
+with gc_frozen():  # what others made in between may be garbage
     during, later = gc.isenabled(), [[] for _ in range(1000)]
 assert during and gc.get_freeze_count() == frozen
 """

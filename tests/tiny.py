@@ -11,9 +11,10 @@ from diffusers.configuration_utils import ConfigMixin, register_to_config
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.cameras import PosedViews
+from geodiff_plugin.evidence.pose_check import CheckedPoses, check_poses, image_facts
+from geodiff_plugin.matching.rows import RowImages, RowMatches, match_rows, row_matches
 from geodiff_plugin.pose.fit import measure_fit, posed_greys
-from geodiff_plugin.pose.refine import CheckedViews, refine_views
-from geodiff_plugin.types import PosedViews
 
 SCHEDULER = {
     "beta_schedule": "scaled_linear",
@@ -88,12 +89,12 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def guided_call(pipe, pair, knobs=(), **call):
-    """The output of a seeded call on a pair, guided by ``knobs`` or by a guidance that is made."""
-    if not isinstance(knobs, GeometryGuidance):
-        knobs = GeometryGuidance(pair.right, pair.K, pair.E, **dict(knobs))
+def guided_call(pipe, pair, parameters=(), **call):
+    """The output of a seeded call on a pair, guided by ``parameters`` or by a guidance that is made."""
+    if not isinstance(parameters, GeometryGuidance):
+        parameters = GeometryGuidance(pair.right, pair.K, pair.E, **dict(parameters))
     drawn = {} if "latents" in call else {"generator": seeded()}
-    return enable_geometry_guidance(pipe)(pair.left, guidance=knobs, **drawn | call)
+    return enable_geometry_guidance(pipe)(pair.left, guidance=parameters, **drawn | call)
 
 
 @dataclass(frozen=True)
@@ -176,10 +177,16 @@ def make_oracle(relative: np.ndarray, prediction_type: str = "depth") -> Marigol
     unet.relative = torch.from_numpy(relative)[None, None].float()
     clean = {"prediction_type": "sample", "rescale_betas_zero_snr": False, "set_alpha_to_one": True}
     parts = unet, OracleVAE(), DDIMScheduler(**SCHEDULER | clean), make_text_encoder(), make_tokenizer()
-    told = {"default_denoising_steps": 2, "default_processing_resolution": 0}
-    return quiet(MarigoldDepthPipeline(*parts, prediction_type=prediction_type, **told))
+    reported = {"default_denoising_steps": 2, "default_processing_resolution": 0}
+    return quiet(MarigoldDepthPipeline(*parts, prediction_type=prediction_type, **reported))
 
 
-def checked_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
-    """What ``refine_views`` makes of views whose fit is measured first."""
-    return refine_views(posed, measure_fit(posed_greys(posed)), measured)
+def checked_views(posed: PosedViews, measured: bool = False) -> CheckedPoses:
+    """What ``check_poses`` makes of views whose fit is measured first."""
+    greys = posed_greys(posed)
+    return check_poses(posed, measure_fit(greys), image_facts(greys), measured)
+
+
+def rows_of(images: RowImages, nearest_px: float) -> RowMatches:
+    """The matches along the rows of a pair; ``nearest_px`` is the largest shift of the search."""
+    return row_matches(images, match_rows(images, images.greys(images.levels.cpu()), nearest_px))

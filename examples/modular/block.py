@@ -1,4 +1,4 @@
-"""Marigold as modular blocks of diffusers, with geometry as blocks of its own; this folder goes to the hub.
+"""Marigold as modular diffusers blocks with geometry blocks; this folder can be published on the hub.
 
     from block import GuidedMarigoldBlocks
 
@@ -7,10 +7,10 @@
     state = pipe(image=left, right=right, K=K, E=E, prediction_type="disparity")
     depth_m, confidence = state.get("depth_m"), state.get("confidence")
 
-``MarigoldBlocks`` is the stock pipeline, stage by stage; ``GuidedMarigoldBlocks`` has three blocks more:
-evidence before the loop, guidance after the denoiser, metres after the loop. Both equal the classic calls bit
-for bit. They guide the clean latent (``gradient="denoised"``) of one image without an ensemble, and leave the
-spacing of the timesteps to the scheduler.
+``MarigoldBlocks`` is the stock pipeline, stage by stage; ``GuidedMarigoldBlocks`` adds geometry:
+evidence before the loop, guidance after the denoiser, metric depth after the loop. Both reproduce the classic
+calls bit for bit. They guide the clean latent (``gradient="denoised"``) of one image without an ensemble, and
+use the scheduler's timestep spacing.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ PROCESSOR = ComponentSpec(
 
 
 class Block(ModularPipelineBlocks):
-    """A leaf: what it needs, what it gives, and ``run`` between the two, without branches.
+    """A leaf block: its inputs, its outputs, and ``run``, without branches.
 
     Attributes:
-        components: that ``run`` uses.
-        needs: inputs by name, with what each is; those in ``optional`` may be missing.
-        gives: outputs by name.
+        components: components used by ``run``.
+        needs: descriptions of required inputs by name; those in ``optional`` may be missing.
+        gives: descriptions of outputs by name.
     """
 
     model_name = "marigold-depth"
@@ -74,32 +74,32 @@ class Block(ModularPipelineBlocks):
 
     @property
     def description(self) -> str:
-        """The first line of the class's docstring."""
+        """Return the first line of the class's docstring."""
         return (inspect.getdoc(type(self)) or "").split("\n")[0]
 
     @property
     def expected_components(self) -> list[ComponentSpec]:
-        """As ``components``."""
+        """Return ``components``."""
         return list(self.components)
 
     @property
     def inputs(self) -> list[InputParam]:
-        """As ``needs`` and ``optional``."""
+        """Return ``needs`` and ``optional``."""
         needs = [InputParam(name, required=True, description=text) for name, text in self.needs.items()]
         return needs + [InputParam(name, description=text) for name, text in self.optional.items()]
 
     @property
     def intermediate_outputs(self) -> list[OutputParam]:
-        """As ``gives``."""
+        """Return ``gives``."""
         return [OutputParam(name, description=text) for name, text in self.gives.items()]
 
     def run(self, components: Any, block_state: Any) -> None:
-        """Read from ``block_state``, and write what the block gives."""
+        """Read inputs from ``block_state``, and write the outputs to it."""
         raise NotImplementedError
 
     @torch.no_grad()
     def __call__(self, components: Any, state: Any) -> tuple[Any, Any]:
-        """``run`` on the part of the pipeline's state that the block names."""
+        """Call ``run`` with the block's part of the pipeline's state."""
         block_state = self.get_block_state(state)
         self.run(components, block_state)
         self.set_block_state(state, block_state)
@@ -107,15 +107,15 @@ class Block(ModularPipelineBlocks):
 
 
 class LoopBlock(Block):
-    """A leaf of the denoising loop, which gets the number of the step and its timestep."""
+    """A leaf block of the denoising loop, called with step number and timestep."""
 
     def step(self, components: Any, block_state: Any, t: torch.Tensor) -> None:
-        """One step's work."""
+        """Perform one step."""
         raise NotImplementedError
 
     @torch.no_grad()
     def __call__(self, components: Any, block_state: Any, i: int, t: torch.Tensor) -> tuple[Any, Any]:
-        """As the loop calls it."""
+        """Call ``step`` from the loop."""
         self.step(components, block_state, t)
         return components, block_state
 
@@ -124,7 +124,7 @@ class TextStep(Block):
     """Embeds the empty prompt."""
 
     components = (TOKENIZER, TEXT_ENCODER)
-    gives = {"prompt_embeds": "(1, 2, C) embedding of no words"}
+    gives = {"prompt_embeds": "(1, 2, C) embedding of the empty prompt"}
 
     def run(self, components: Any, block_state: Any) -> None:
         """Tokenise and embed."""
@@ -138,11 +138,11 @@ class ImageStep(Block):
     """Resizes and pads the image, and encodes it."""
 
     components = (VAE, PROCESSOR)
-    needs = {"image": "the left image, which gets the depth"}
-    optional = {"processing_resolution": "longer side for the prior, px; 768 by default"}
+    needs = {"image": "reference (left) image"}
+    optional = {"processing_resolution": "longer side for the prior, px (default: 768)"}
     gives = {
         "image_latent": "(1, C, h, w)",
-        "padding": "rows and columns that were added",
+        "padding": "number of padded rows and columns",
         "original_resolution": "(H, W) of the image",
         "content": "(H, W) of the processing grid without padding",
     }
@@ -160,14 +160,14 @@ class ImageStep(Block):
 
 
 class NoiseStep(Block):
-    """Draws the noise that the loop begins with."""
+    """Draws the initial noise."""
 
     needs = {"image_latent": "(1, C, h, w)"}
-    optional = {"generator": "source of everything that is drawn"}
+    optional = {"generator": "random generator"}
     gives = {"latents": "(1, C, h, w) noise"}
 
     def run(self, components: Any, block_state: Any) -> None:
-        """As large as the image's latent."""
+        """Draw noise in the size of the image latent."""
         like = block_state.image_latent
         block_state.latents = randn_tensor(
             like.shape, generator=block_state.generator, device=like.device, dtype=like.dtype
@@ -178,12 +178,12 @@ class TimestepsStep(Block):
     """Sets the scheduler's timesteps."""
 
     components = (SCHEDULER,)
-    needs = {"image_latent": "says the device"}
-    optional = {"num_inference_steps": "4 by default"}
-    gives = {"timesteps": "of the denoising loop"}
+    needs = {"image_latent": "determines the device"}
+    optional = {"num_inference_steps": "number of denoising steps (default: 4)"}
+    gives = {"timesteps": "timesteps of the denoising loop"}
 
     def run(self, components: Any, block_state: Any) -> None:
-        """As the scheduler spaces them."""
+        """Set the timesteps with the scheduler's spacing."""
         steps = block_state.num_inference_steps or 4
         components.scheduler.set_timesteps(steps, device=block_state.image_latent.device)
         block_state.timesteps = components.scheduler.timesteps
@@ -193,25 +193,25 @@ class DenoiserStep(LoopBlock):
     """Predicts the noise."""
 
     components = (UNET,)
-    needs = {"latents": "z_t", "image_latent": "of the image", "prompt_embeds": "of no words"}
+    needs = {"latents": "z_t", "image_latent": "latent of the image", "prompt_embeds": "empty prompt"}
 
     def step(self, components: Any, block_state: Any, t: torch.Tensor) -> None:
-        """One pass of the network."""
+        """Run the network once."""
         both = torch.cat([block_state.image_latent, block_state.latents], dim=1)
         text = block_state.prompt_embeds.to(both.dtype)
         block_state.noise_pred = components.unet(both, t, encoder_hidden_states=text, return_dict=False)[0]
 
 
 class GeometryStep(LoopBlock):
-    """Moves what the network predicted towards what the views say.
+    """Guides the prediction of the network towards consistency with the views.
 
-    It reads and writes ``latents`` and ``noise_pred`` alone, so any loop with these two may hold it.
+    Reads and writes only ``latents`` and ``noise_pred``, so it works in any loop with these two.
     """
 
-    needs = {"latents": "z_t", "geometry": "of GeometryEvidenceStep"}
+    needs = {"latents": "z_t", "geometry": "from GeometryEvidenceStep"}
 
     def step(self, components: Any, block_state: Any, t: torch.Tensor) -> None:
-        """The network output and noisy latent under which the scheduler gives the guided latent."""
+        """Replace network output and noisy latent so that the scheduler yields the guided latent."""
         run = block_state.geometry
         with frozen_weights(run.pipe):
             output, z_t, _ = run.guide(block_state.noise_pred, t.cpu(), block_state.latents)
@@ -219,31 +219,31 @@ class GeometryStep(LoopBlock):
 
 
 class SchedulerStep(LoopBlock):
-    """The scheduler's own step."""
+    """Performs the scheduler's step."""
 
     components = (SCHEDULER,)
     needs = {"latents": "z_t"}
-    optional = {"generator": "source of everything that is drawn"}
+    optional = {"generator": "random generator"}
 
     def step(self, components: Any, block_state: Any, t: torch.Tensor) -> None:
-        """From z_t to z_{t-1}."""
+        """Step from z_t to z_{t-1}."""
         block_state.latents = components.scheduler.step(
             block_state.noise_pred, t, block_state.latents, generator=block_state.generator
         ).prev_sample
 
 
 class AfterStep(LoopBlock):
-    """Tells the guidance that the step is over."""
+    """Ends the guidance of a step."""
 
-    needs = {"latents": "z_{t-1}", "geometry": "of GeometryEvidenceStep"}
+    needs = {"latents": "z_{t-1}", "geometry": "from GeometryEvidenceStep"}
 
     def step(self, components: Any, block_state: Any, t: torch.Tensor) -> None:
-        """The next call of ``guide`` is of the next step."""
+        """Advance the guidance to the next step."""
         block_state.latents = block_state.geometry.after_step(t, block_state.latents)
 
 
 class DenoiseLoop(LoopSequentialPipelineBlocks):
-    """Denoises; ``sub_blocks`` says what a step does."""
+    """Denoises; ``sub_blocks`` are the operations of a step."""
 
     model_name = "marigold-depth"
     block_classes = [DenoiserStep, SchedulerStep]
@@ -251,22 +251,22 @@ class DenoiseLoop(LoopSequentialPipelineBlocks):
 
     @property
     def description(self) -> str:
-        """The loop over the timesteps."""
+        """Return the description of the loop."""
         return "Denoising loop: its sub-blocks run in order at every timestep."
 
     @property
     def loop_inputs(self) -> list[InputParam]:
-        """The timesteps."""
-        return [InputParam("timesteps", required=True, description="of TimestepsStep")]
+        """Return the timesteps."""
+        return [InputParam("timesteps", required=True, description="from TimestepsStep")]
 
     @property
     def loop_intermediate_outputs(self) -> list[OutputParam]:
-        """The clean latent."""
+        """Return the clean latent."""
         return [OutputParam("latents", description="(1, C, h, w)")]
 
     @torch.no_grad()
     def __call__(self, components: Any, state: Any) -> tuple[Any, Any]:
-        """Every sub-block at every timestep."""
+        """Run every sub-block at every timestep."""
         block_state = self.get_block_state(state)
         with self.progress_bar(total=len(block_state.timesteps)) as bar:
             for i, t in enumerate(block_state.timesteps):
@@ -284,16 +284,16 @@ class GuidedDenoiseLoop(DenoiseLoop):
 
 
 def _at_image_size(processor: Any, values: torch.Tensor, block_state: Any) -> Any:
-    """A map ``(1, 1, h, w)``, unpadded and resized to the image."""
+    """Unpad a map ``(1, 1, h, w)`` and resize it to the image."""
     values = processor.unpad_image(values, block_state.padding)
     return processor.resize_antialias(values, block_state.original_resolution, "bilinear", is_aa=False)
 
 
 class DecodeStep(Block):
-    """Decodes the relative depth, as the stock pipeline does."""
+    """Decodes the relative depth like the stock pipeline."""
 
     components = (VAE, PROCESSOR)
-    needs = {"latents": "clean", "padding": "to remove", "original_resolution": "of the image"}
+    needs = {"latents": "clean latents", "padding": "padding to remove", "original_resolution": "(H, W)"}
     gives = {"relative_depth": "(1, H, W, 1) in [0, 1]"}
 
     def run(self, components: Any, block_state: Any) -> None:
@@ -305,79 +305,80 @@ class DecodeStep(Block):
 
 
 class GeometryEvidenceStep(Block):
-    """Compares the views, once before the loop: cost volume, matches, poses; and plans the steps."""
+    """Computes cost volume, matches and poses once before the loop, and plans the guided steps."""
 
     components = (UNET, VAE, SCHEDULER, TOKENIZER, TEXT_ENCODER)
-    needs = {"image": "the left image", "content": "of ImageStep", "padding": "of ImageStep"}
+    needs = {"image": "the left image", "content": "from ImageStep", "padding": "from ImageStep"}
     optional = {
-        "right": "right image, or a tuple of several; none with points alone",
+        "right": "right image, or a tuple of several; omitted with points only",
         "K": "3x3 intrinsics in pixels, or a tuple of one per view",
         "E": "4x4 pose of the right camera in the left camera's frame, metres",
         "points": "known depths, a sparse map (H, W) or (N, 3) points, metres",
-        "knobs": "hyperparameters of GeometryGuidance, as a dict",
+        "parameters": "parameters of GeometryGuidance, as a dict",
         "num_inference_steps": "denoising steps",
-        "prediction_type": "what the prior's map is affine in: depth (the default) or disparity",
+        "prediction_type": "prediction space of the prior: depth (default) or disparity",
     }
     gives = {
         "geometry": "state of the guided call",
         "guidance": "GeometryGuidance",
         "call": "arguments of the classic call, by name",
-        "num_inference_steps": "at least the knob min_steps",
+        "num_inference_steps": "at least the parameter min_steps",
     }
 
     def run(self, components: Any, block_state: Any) -> None:
         """Prepare the guided run on the same networks."""
         parts = {spec.name: getattr(components, spec.name) for spec in self.components}
         host = MarigoldDepthPipeline(**parts, prediction_type=block_state.prediction_type or "depth")
-        knobs = {**(block_state.knobs or {}), "points": block_state.points}
-        guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **knobs)
+        parameters = {**(block_state.parameters or {}), "points": block_state.points}
+        guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **parameters)
         asked = block_state.num_inference_steps
         steps, rounds = count_guided_steps(host, guidance, asked)
         lefts_01 = left_images(block_state.image).to(host.vae.device)
-        evidence = guidance.prepare(lefts_01)
+        guidance.check_left_images(lefts_01)
+        plans = guidance.plan_evidence(lefts_01)
         signature = inspect.signature(host.__call__)
         call = {name: value.default for name, value in signature.parameters.items()}
         call |= {"image": lefts_01, "num_inference_steps": steps}
         grid = ProcessingGrid(block_state.content, block_state.padding)
         codec = MapCodec(host, prior_of(host), grid)
-        block_state.geometry = GuidedRun(codec, guidance, lambda: evidence, call, rounds)
+        block_state.geometry = GuidedRun(codec, guidance, lambda: plans, call, rounds)
         block_state.guidance, block_state.call, block_state.num_inference_steps = guidance, call, steps
 
 
 class GeometryBeginStep(Block):
-    """Plans which of the loop's steps are corrected or updated."""
+    """Plans which steps of the loop fit matches or update latents."""
 
-    needs = {"geometry": "of GeometryEvidenceStep", "timesteps": "of TimestepsStep"}
+    needs = {"geometry": "from GeometryEvidenceStep", "timesteps": "from TimestepsStep"}
 
     def run(self, components: Any, block_state: Any) -> None:
-        """Make the schedule."""
+        """Compute the schedule."""
         block_state.geometry.begin(block_state.timesteps.cpu())
 
 
 class MetresStep(Block):
-    """Decodes metric depth, fits it to the matches at the image's size, and judges it."""
+    """Decodes metric depth, fits it to the matches at image resolution, and computes the verdict."""
 
     components = (PROCESSOR,)
     needs = {
-        "latents": "clean",
-        "geometry": "of GeometryEvidenceStep",
-        "guidance": "of GeometryEvidenceStep",
-        "call": "of GeometryEvidenceStep",
-        "padding": "to remove",
-        "original_resolution": "of the image",
+        "latents": "clean latents",
+        "geometry": "from GeometryEvidenceStep",
+        "guidance": "from GeometryEvidenceStep",
+        "call": "from GeometryEvidenceStep",
+        "padding": "padding to remove",
+        "original_resolution": "(H, W)",
     }
     gives = {
         "depth_m": "(H, W) metres",
-        "confidence": "(H, W) probability that the depth is within 10 %",
+        "confidence": "(H, W) probability that the depth error is below 10 % if the calibration is correct",
         "guided_output": "MetricDepthOutput of the guided call",
     }
 
     def run(self, components: Any, block_state: Any) -> None:
-        """As the guided pipeline ends a call."""
+        """Finish the call like the guided pipeline."""
         run, processor = block_state.geometry, components.image_processor
         depth_m = _at_image_size(processor, run.metric_prediction(block_state.latents), block_state)
         stock = MarigoldDepthOutput(depth_m, None, None)
-        out = run.output(stock, block_state.guidance.warned)
+        out = run.output(stock, block_state.guidance.findings)
         block_state.guided_output, block_state.depth_m = out, out.prediction[0, ..., 0]
         block_state.confidence = out.confidence[0, ..., 0]
         run.release()

@@ -1,4 +1,4 @@
-"""The guided call in the form that the robustmvd benchmark asks of a model, with its three metrics.
+"""Wraps the guided call as a model of the robustmvd benchmark, with its three metrics.
 
     from rmvd import create_dataset, create_evaluation  # github.com/lmb-freiburg/robustmvd
     from examples.robustmvd.model import GeoDiffModel
@@ -6,7 +6,7 @@
     evaluation = create_evaluation("mvd", inputs=["images", "intrinsics", "poses"], eval_uncertainty=True)
     results = evaluation(dataset=create_dataset("eth3d", "mvd"), model=GeoDiffModel("bundled"))
 
-Nothing of the benchmark is imported here: a model is anything with these three methods.
+Does not import the benchmark: a model is any object with these three methods.
 """
 
 from __future__ import annotations
@@ -22,29 +22,31 @@ from geodiff_plugin.evaluation.metrics import ause, evaluate_depth
 
 __all__ = ["GeoDiffModel", "benchmark_metrics"]
 
-#: Relative error within which a pixel is an inlier in the benchmark's tables.
-INLIER = 1.03
-
 
 class GeoDiffModel:
-    """A prior that is made metric by the source views.
+    """A prior made metric by the source views.
 
     Args:
-        prior: anything that ``load_prior`` takes.
+        prior: any name accepted by ``load_prior``.
         device: torch device.
-        seed: of the initial noise.
-        max_sources: source views that are used, the nearest of the list first.
-        **knobs: of ``GeometryGuidance``.
+        seed: seed of the initial noise.
+        max_sources: maximum number of source views; those nearest in the list are used first.
+        **parameters: parameters of ``GeometryGuidance``.
     """
 
     name = "geodiff"
 
     def __init__(
-        self, prior: str = "bundled", device: str = "cpu", seed: int = 0, max_sources: int = 4, **knobs: Any
+        self,
+        prior: str = "bundled",
+        device: str = "cpu",
+        seed: int = 0,
+        max_sources: int = 4,
+        **parameters: Any,
     ) -> None:
         self.pipe = enable_geometry_guidance(load_prior(prior, device=device))
         self.pipe.set_progress_bar_config(disable=True)
-        self.seed, self.max_sources, self.knobs = seed, max_sources, knobs
+        self.seed, self.max_sources, self.parameters = seed, max_sources, parameters
 
     def input_adapter(
         self,
@@ -54,20 +56,22 @@ class GeoDiffModel:
         intrinsics: Sequence[np.ndarray] | None = None,
         depth_range: Any = None,
     ) -> dict[str, Any]:
-        """A batch of one sample, as the benchmark's loader collates it, as arguments of ``__call__``.
+        """Convert a batch of one sample from the benchmark's loader to arguments of ``__call__``.
 
         Args:
-            images: of every view ``(1, 3, H, W)`` float in [0, 255].
-            keyview_idx: index of the view that gets the depth, a number or an array of one.
-            poses: of every view ``(1, 4, 4)``, which takes points of a common frame into that of the view.
-            intrinsics: of every view ``(1, 3, 3)``, pixels.
-            depth_range: not used: the views give the range.
+            images: one per view, ``(1, 3, H, W)`` float in [0, 255].
+            keyview_idx: index of the key view, a number or an array of one.
+            poses: one per view, ``(1, 4, 4)`` world-to-camera.
+            intrinsics: one per view, ``(1, 3, 3)`` pixels.
+            depth_range: unused; the range is estimated from the views.
 
         Raises:
-            ValueError: no poses or no intrinsics; a batch of several samples.
+            ValueError: missing poses or intrinsics, or a batch of several samples.
         """
         if poses is None or intrinsics is None:
-            raise ValueError('Evaluate with inputs=["images", "intrinsics", "poses"]: metres come from them.')
+            raise ValueError(
+                'Metric depth needs poses and intrinsics. Pass inputs=["images", "intrinsics", "poses"].'
+            )
         if any(len(image) != 1 for image in images):
             raise ValueError(f"Evaluate one sample at a time; got a batch of {len(images[0])}.")
         key = int(np.asarray(keyview_idx).reshape(-1)[0])
@@ -78,47 +82,47 @@ class GeoDiffModel:
         return {
             "views": [np.clip(row, 0, 255).round().astype(np.uint8) for row in rows],
             "K": [np.asarray(intrinsics[i][0], np.float64) for i in (key, *chosen)],
-            # The pose of each source camera in the key camera's frame.
+            # pose of each source camera in the key camera's frame
             "E": [to_key @ np.linalg.inv(np.asarray(poses[i][0], np.float64)) for i in chosen],
         }
 
     def __call__(self, views: list[np.ndarray], K: list[np.ndarray], E: list[np.ndarray]) -> Any:
-        """The ``MetricDepthOutput`` of the guided call; without a source view there is no scale."""
+        """Run the guided call; needs a source view for the scale."""
         if not E:
-            raise ValueError("A source view must be given: one view alone has no scale.")
+            raise ValueError("At least one source view is needed; a single view has no metric scale.")
         posed = list(zip(views, K, [np.eye(4), *E], strict=True))
-        guidance = GeometryGuidance.from_views(posed, **self.knobs)
+        guidance = GeometryGuidance.from_views(posed, **self.parameters)
         seeded = torch.Generator(self.pipe.device).manual_seed(self.seed)
         return self.pipe(views[0], guidance=guidance, generator=seeded)
 
     def output_adapter(self, output: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Depth ``(1, 1, H, W)`` metres and ``1 - confidence`` as its uncertainty; the rest beside it."""
+        """Return depth ``(1, 1, H, W)`` metres, ``1 - confidence`` as uncertainty, and auxiliary output."""
         depth_m = np.asarray(output.prediction).transpose(0, 3, 1, 2)
         pred = {"depth": depth_m, "depth_uncertainty": np.zeros_like(depth_m)}
         if output.confidence is not None:
             pred["depth_uncertainty"] = 1.0 - np.asarray(output.confidence).transpose(0, 3, 1, 2)
-        return pred, {"verdict": output.verdict.sentence, "warnings": list(output.warnings)}
+        return pred, {"verdict": output.verdict.status, "findings": list(output.findings)}
 
 
 def benchmark_metrics(
-    depth_m: np.ndarray, truth_m: np.ndarray, uncertainty: np.ndarray | None = None
+    depth_m: np.ndarray, ground_truth_m: np.ndarray, uncertainty: np.ndarray | None = None
 ) -> dict[str, float]:
-    """The benchmark's numbers for one map, by this package's own evaluation.
+    """Compute the benchmark's metrics of one map with this package's evaluation.
 
     Args:
         depth_m: ``(H, W)`` metres.
-        truth_m: ``(H, W)`` metres, 0 where unknown.
+        ground_truth_m: ``(H, W)`` metres, 0 where unknown.
         uncertainty: ``(H, W)``, larger is less certain.
 
     Returns:
-        ``absrel`` and ``inliers103`` in per cent, ``ause`` as a share of ``absrel``: the benchmark divides
-        its sparsification curves by their start.
+        ``absrel`` and ``inliers103`` in per cent, ``ause`` relative to ``absrel``: the benchmark normalises
+        its sparsification curves by their first value.
     """
-    valid = truth_m > 0
-    clipped = np.clip(depth_m, 0.1, 100.0)  # as it clips what it is given
-    abs_rel = evaluate_depth(clipped, truth_m, valid)["abs_rel"]
-    ratio = np.maximum(clipped[valid] / truth_m[valid], truth_m[valid] / clipped[valid])
-    scores = {"absrel": 100 * abs_rel, "inliers103": 100 * float(np.mean(ratio < INLIER))}
+    valid = ground_truth_m > 0
+    clipped = np.clip(depth_m, 0.1, 100.0)  # the benchmark clips predictions too
+    measured = evaluate_depth(clipped, ground_truth_m, valid)
+    abs_rel = measured["abs_rel"]
+    scores = {"absrel": 100 * abs_rel, "inliers103": 100 * measured["inliers"]}
     if uncertainty is not None:
-        scores["ause"] = ause(clipped, truth_m, valid, uncertainty) / abs_rel
+        scores["ause"] = ause(clipped, ground_truth_m, valid, uncertainty) / abs_rel
     return scores

@@ -2,7 +2,7 @@
 
     python examples/robustmvd/write_cameras.py FOLDER
 
-FOLDER is what ``download_tanks_and_temples.sh`` fetched. Needs robustmvd, whose sample list is a pickle.
+FOLDER is the output of ``download_tanks_and_temples.sh``. Needs robustmvd, whose sample list is a pickle.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 
 def write_cameras(root: Path, samples: Any) -> None:
-    """``cams/*_cam.txt`` of every view and ``pair.txt`` of every scene, from the benchmark's samples."""
+    """Write ``cams/*_cam.txt`` per view and ``pair.txt`` per scene from the benchmark's samples."""
     pairs: dict[str, list[str]] = {}
     for sample in samples:
         views = [int(Path(image.path).stem) for image in sample.data["images"]]
@@ -30,7 +30,7 @@ def write_cameras(root: Path, samples: Any) -> None:
 
 
 if __name__ == "__main__":
-    import rmvd  # the benchmark, installed beside this package
+    import rmvd  # the benchmark, a separate installation
 
     folder = Path(sys.argv[1])
     write_cameras(folder, rmvd.create_dataset("tanks_and_temples.robustmvd.mvd", root=str(folder)).samples)

@@ -1,7 +1,7 @@
-"""Mean of two runs' weights: ``python -m examples.training.blend --help``.
+"""Averages the weights of two runs: ``python -m examples.training.blend --help``.
 
-Data flow: two prior folders of one autoencoder -> one whose U-Net lies between theirs.
-Paper: none; weights of a run and of its continuation are averaged as in "Model soups" (arXiv 2203.05482).
+Data flow: two prior folders with the same autoencoder -> one whose U-Net interpolates between theirs.
+Paper: none; the weights of a run and its continuation are averaged as in "Model soups" (arXiv 2203.05482).
 """
 
 from __future__ import annotations
@@ -13,35 +13,35 @@ import torch
 from diffusers import MarigoldDepthPipeline
 
 from examples.training.models import save_prior
-from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin._internal.checks import bad_value, check_number
 from geodiff_plugin.bundled import open_pipeline
 
 __all__ = ["blend", "main"]
 
 
 @torch.no_grad()
-def blend(first: Path, second: Path, share: float) -> MarigoldDepthPipeline:
-    """The second pipeline with a U-Net ``(1 - share) * first + share * second``.
+def blend(first: Path, second: Path, fraction: float) -> MarigoldDepthPipeline:
+    """Return the second pipeline with the U-Net ``(1 - fraction) * first + fraction * second``.
 
     Args:
         first: prior folder.
-        second: prior folder that was trained on from the first, or from where the first came from.
-        share: of the second, in [0, 1].
+        second: prior folder trained from the first, or from the same weights as the first.
+        fraction: weight of the second, in [0, 1].
 
     Returns:
         A new pipeline on the CPU, float32, with the second's options.
 
     Raises:
-        ValueError: ``share`` is out of range, or the autoencoders differ, so that the latents do.
+        ValueError: ``fraction`` is out of range, or the autoencoders (and so the latents) differ.
     """
-    check_number(share, "share", 0, 1)
+    check_number(fraction, "fraction", 0, 1)
     start, end = open_pipeline(first), open_pipeline(second)
     codes = start.vae.state_dict()
     if any(not torch.equal(value, codes[name]) for name, value in end.vae.state_dict().items()):
         bad_value("second", f"a prior with the autoencoder of {first}", second, "Train it with --init-from.")
     weights = start.unet.state_dict()
     for name, value in end.unet.state_dict().items():
-        value.copy_(torch.lerp(weights[name], value, share))
+        value.copy_(torch.lerp(weights[name], value, fraction))
     return end
 
 
@@ -49,11 +49,11 @@ def main(argv: list[str] | None = None) -> None:
     """Command line; see ``--help``."""
     parser = argparse.ArgumentParser(prog="python -m examples.training.blend", description=__doc__)
     parser.add_argument("first", type=Path, help="prior folder")
-    parser.add_argument("second", type=Path, help="prior folder trained on from it")
-    parser.add_argument("--share", type=float, default=0.5, help="of the second, 0 to 1")
+    parser.add_argument("second", type=Path, help="prior folder trained from the first")
+    parser.add_argument("--fraction", type=float, default=0.5, help="weight of the second, 0 to 1")
     parser.add_argument("--out", type=Path, required=True, help="prior folder to write")
     options = parser.parse_args(argv)
-    save_prior(blend(options.first, options.second, options.share), options.out)
+    save_prior(blend(options.first, options.second, options.fraction), options.out)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fixtures of the package's tests that the tests of the training use."""
+"""Fixtures of the package's tests, used by the training's tests."""
 
 from tests.conftest import textured_plane
 

@@ -1,8 +1,8 @@
-"""Cache of rendered scenes on disk, and the normalised disparity that is learnt.
+"""Cache of rendered scenes on disk, and the normalised disparity that the prior learns.
 
 Data flow: seeds -> ``synthetic.render_mono`` -> shards (uint8 images, float16 depth in metres)
     -> [-1, 1] targets.
-Paper: none; the target is normalised as Marigold's (2 % and 98 % quantiles), of inverse depth.
+Paper: none; the target is inverse depth, normalised like Marigold's (2 % and 98 % quantiles).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SHAPES = ((192, 256), (128, 416), (192, 256), (192, 192), (192, 256), (128, 416)
 """Image sizes (H, W) that shards cycle through: landscape mostly, KITTI's 3.3:1, square, portrait, 16:9."""
 
 STREETS_AT = 1
-"""Of each cycle the shard that shows streets only: pictures as wide as that one are taken from cars."""
+"""The shard of each cycle that shows only streets, because images of this width are taken from cars."""
 
 HELD_OUT_SEED = 1
 """Held-out scenes have the seeds 1, 2, ...; training scenes start at one million."""
@@ -62,7 +62,7 @@ def shard_kind(index: int) -> str | None:
 
 
 def render_as_shard(index: int, seeds: list[int], device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Images ``(N, 3, H, W)`` in [0, 1] and metres ``(N, 1, H, W)``, size and kind as in a shard."""
+    """Images ``(N, 3, H, W)`` in [0, 1] and metres ``(N, 1, H, W)``, with the shard's size and kind."""
     from tests.scenes import render_mono
 
     return render_mono(seeds, shard_size(index), device, augment=True, kind=shard_kind(index))
@@ -76,12 +76,12 @@ def train_seeds(index: int) -> list[int]:
 def held_out(
     count: int, size: tuple[int, int] = (192, 256), device: str = "cpu"
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Scenes that training never sees.
+    """Render scenes that are not used for training.
 
     Args:
         count: number of scenes, >= 1.
         size: image size (H, W).
-        device: where to render.
+        device: device for rendering.
 
     Returns:
         Images ``(N, 3, H, W)`` float32 in [0, 1] and depth ``(N, 1, H, W)`` float32 in metres, inf for sky;
@@ -99,26 +99,26 @@ def held_out(
 
 
 def normalise_disparity(depth_m: torch.Tensor) -> torch.Tensor:
-    """Depth as the prior is trained on it: inverse, between its own quantiles.
+    """Convert depth to the training target: inverse depth, normalised by its quantiles.
 
-    Inverse depth spends the range where metres are dear: with an error of 0.1 (0.2) in [-1, 1] as smooth as
+    Inverse depth is more precise at near range. With an error of 0.1 (0.2) in [-1, 1] that is as smooth as
     a prior's, normalised depth gives the rectified street pairs an aligned AbsRel of .13 to .22 (.27 to .47),
-    normalised disparity .07 to .16 (.18 to .26, one .68), and what is near, which a second view resolves
-    best, keeps its shape.
+    normalised disparity .07 to .16 (.18 to .26, one .68), and near objects, which a second view
+    resolves best, keep their shape.
 
     Args:
         depth_m: ``(N, 1, H, W)`` metres, inf for sky.
 
     Returns:
-        ``(N, 1, H, W)`` float32 in [-1, 1]: of the inverse depth the 2 % quantile and the sky are -1, the
-        98 % quantile is 1; a scene without spread is 0.
+        ``(N, 1, H, W)`` float32 in [-1, 1]: the 2 % quantile of inverse depth and the sky are -1, the
+        98 % quantile is 1; a scene of constant depth is 0.
     """
     inverse = torch.where(depth_m.isfinite(), 1.0 / depth_m.float().clamp_min(1e-3), torch.inf)
-    ordered = inverse.flatten(1).sort(dim=1).values  # inf goes last, so finite values fill the front
+    ordered = inverse.flatten(1).sort(dim=1).values  # inf is sorted last
     count = ordered.isfinite().sum(dim=1, keepdim=True)
     low = ordered.gather(1, (0.02 * (count - 1)).long().clamp(min=0))[..., None, None]
     high = ordered.gather(1, (0.98 * (count - 1)).long().clamp(min=0))[..., None, None]
-    spread = (high - low) / high  # relative, so that a scene's scale does not matter
+    spread = (high - low) / high  # relative, and so independent of the scene's scale
     unit = ((inverse - low) / (high - low).clamp(min=1e-9)).clamp(0.0, 1.0)
     unit = torch.where(inverse.isfinite(), unit, torch.zeros_like(unit))
     usable = (count[..., None, None] > 0) & (spread > 1e-4)
@@ -126,7 +126,7 @@ def normalise_disparity(depth_m: torch.Tensor) -> torch.Tensor:
 
 
 def jitter(images_01: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Change colour and exposure of each image at random; one in four turns grey.
+    """Change colour and exposure of each image at random; one in four becomes grey.
 
     Args:
         images_01: ``(N, 3, H, W)`` in [0, 1].
@@ -150,7 +150,7 @@ def jitter(images_01: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
 
 
 def shards(cache: Path) -> list[int]:
-    """Indices of the shards that are complete in the cache, in order."""
+    """Return the indices of the complete shards in the cache, in order."""
     return sorted(int(path.stem) for path in Path(cache).glob("scenes/*.safetensors"))
 
 
@@ -164,11 +164,11 @@ def render_shards(cache: Path, first: int, stop: int, step: int = 1, device: str
     """Render the training shards ``first, first + step, ...`` below ``stop`` that the cache lacks.
 
     Args:
-        cache: folder; shards go to ``scenes/``, each written whole or not at all.
+        cache: folder; shards go to ``scenes/``, written atomically.
         first: index of the first shard.
         stop: end of the range.
         step: stride, for several workers.
-        device: where to render.
+        device: device for rendering.
 
     Yields:
         The index of each new shard.
@@ -192,7 +192,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Render training scenes into a cache.")
     parser.add_argument("--cache", type=Path, required=True)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--stop", type=int, default=1000, help="end of the shard range; 16 scenes a shard")
+    parser.add_argument("--stop", type=int, default=1000, help="end of the shard range; 16 scenes per shard")
     parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)

@@ -1,7 +1,7 @@
 """Zero-shot errors of the bundled prior: ``python -m examples.training.evaluate``.
 
-Data flow: real pairs (left image, truth) and held-out rendered scenes -> aligned errors -> a Markdown table.
-Paper: S5.1 (AbsRel, delta1); the plane and the constant are ours, as what any prior must beat.
+Data flow: real pairs (left image, ground truth) and held-out rendered scenes -> aligned errors -> Markdown.
+Paper: S5.1 (AbsRel, delta1); the plane and the constant are our baselines, which any prior must beat.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["best_constant", "best_plane", "main", "score_pairs"]
 
 
 def best_plane(depth_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """The least-squares plane ``a x + b y + c`` through the true depth.
+    """Fit the least-squares plane ``a x + b y + c`` to the ground-truth depth.
 
     Args:
         depth_m: ``(H, W)`` metres.
@@ -40,14 +40,14 @@ def best_plane(depth_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def best_constant(depth_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """The mean of the true depth everywhere, ``(H, W)`` float64 metres: the least-squares constant."""
+    """Return a map of the mean ground-truth depth, ``(H, W)`` float64 metres: the least-squares constant."""
     return np.full(depth_m.shape, float(depth_m[valid].astype(np.float64).mean()))
 
 
 def score_pairs(
     pipeline: MarigoldDepthPipeline, root: Path, steps: int | None = None, resolution: int | None = None
 ) -> list[dict[str, str | float]]:
-    """AbsRel and delta1 on every metric pair below a folder, from the left image alone.
+    """Compute AbsRel and delta1 from the left image alone, for every metric pair below a folder.
 
     Args:
         pipeline: the prior.
@@ -56,7 +56,7 @@ def score_pairs(
         resolution: processing resolution; the pipeline's default for ``None``.
 
     Returns:
-        One row a pair: ``dataset``, ``name``, ``prior``, ``delta1``, ``plane``, ``constant``.
+        One row per pair: ``dataset``, ``name``, ``prior``, ``delta1``, ``plane``, ``constant``.
     """
     rows = []
     for sample in map(load, find_pairs(root)):
@@ -100,12 +100,10 @@ def main(argv: list[str] | None = None) -> None:
     )
     parser.add_argument("--data", type=Path, help="folder of real pairs; none are scored without it")
     parser.add_argument("--scenes", type=int, default=200, help="held-out rendered scenes, 0 for none")
-    parser.add_argument(
-        "--steps", type=int, nargs="*", help="denoising steps to try; the default ones if left out"
-    )
+    parser.add_argument("--steps", type=int, nargs="*", help="denoising steps to try; the default if omitted")
     parser.add_argument("--resolution", type=int, nargs="*", help="processing resolutions to try")
     parser.add_argument("--sheet", type=Path, help="PNG of six held-out scenes to write")
-    parser.add_argument("--threads", type=int, default=0, help="torch's choice for 0")
+    parser.add_argument("--threads", type=int, default=0, help="number of threads; 0: torch's default")
     options = parser.parse_args(argv)
     if options.threads:
         torch.set_num_threads(options.threads)

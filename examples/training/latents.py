@@ -1,4 +1,4 @@
-"""Latents of rendered scenes: encoded once, kept on disk, drawn in batches.
+"""Latents of rendered scenes: encoded once, cached on disk, drawn in batches.
 
 Data flow: shard -> flips and colour jitter -> VAE encoder -> float16 latents -> a batch of one shape.
 Paper: S3.1 (the prior works in the latent space of a VAE).
@@ -30,7 +30,7 @@ __all__ = ["LatentStore", "encode_scenes", "resize_scenes"]
 def resize_scenes(
     images: torch.Tensor, depth_m: torch.Tensor, divisor: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Images averaged, depth picked, at ``1 / divisor`` of the size; both kept for 1."""
+    """Average images and subsample depth to ``1 / divisor`` of the size; both unchanged for 1."""
     if divisor == 1:
         return images, depth_m
     middle = divisor // 2
@@ -41,7 +41,7 @@ def resize_scenes(
 def encode_scenes(
     vae: AutoencoderKL, images: torch.Tensor, depth_m: torch.Tensor, generator: torch.Generator, flip: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Latents as Marigold makes them: encoder mode times ``scaling_factor``.
+    """Encode as Marigold does: encoder mode times ``scaling_factor``.
 
     Args:
         vae: frozen autoencoder; its device is used.
@@ -54,22 +54,21 @@ def encode_scenes(
         Image and depth latents ``(N, 4, H/4, W/4)`` float16 on the VAE's device.
     """
     device = vae.device
-    picture = 2.0 * jitter(images.to(device), generator) - 1.0
+    image = 2.0 * jitter(images.to(device), generator) - 1.0
     target = normalise_disparity(depth_m.to(device)).expand(-1, 3, -1, -1)
     if flip:
-        picture, target = picture.flip(-1), target.flip(-1)
+        image, target = image.flip(-1), target.flip(-1)
     with torch.autocast(device.type, dtype=torch.bfloat16):
-        moments = [vae.encode(x).latent_dist.mode() for x in (picture, target)]
+        moments = [vae.encode(x).latent_dist.mode() for x in (image, target)]
     scale = vae.config.scaling_factor
     return tuple((latent.float() * scale).half() for latent in moments)
 
 
 class LatentStore:
-    """All latents that one process trains on, growing while scenes are rendered.
+    """Latents that one process trains on; grows while scenes are rendered.
 
-    With several processes each takes every ``world``-th shard. Encoded shards are kept in the cache, so that
-    a continued run does not encode again. With ``fresh=True`` (a GPU) nothing is stored: each batch is
-    rendered.
+    With several processes, each uses every ``world``-th shard. Encoded shards are cached, so that a continued
+    run does not encode them again. With ``fresh=True`` (a GPU) nothing is stored, and each batch is rendered.
 
     Args:
         cache: the cache folder of ``data.render_shards``.
@@ -102,13 +101,13 @@ class LatentStore:
         return SHARD * len(self._items) // self.variants
 
     def refresh(self, most: int) -> int:
-        """Take in new shards of the cache, newest first; encoded ones are only read.
+        """Add new shards of the cache, newest first; encoded ones are only read.
 
         Args:
             most: shards to encode, >= 0.
 
         Returns:
-            How many were taken in.
+            Number of added shards.
         """
         if self.fresh:
             return 0
@@ -125,7 +124,7 @@ class LatentStore:
         return len(self._known) - before
 
     def batch(self, size: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw image and depth latents ``(size, 4, h, w)`` float32, all of one shape."""
+        """Draw image and depth latents ``(size, 4, h, w)`` float32, all of the same shape."""
         if self.fresh:
             return self._render(size, generator)
         first = self._items[int(torch.randint(len(self._items), (), generator=generator))]
@@ -165,6 +164,6 @@ class LatentStore:
 
 
 def _fingerprint(vae: AutoencoderKL) -> str:
-    """Short name of the encoder's weights, so that latents of another VAE are never used."""
+    """Return a fingerprint of the encoder's weights, so that latents of another VAE are never used."""
     weight = vae.encoder.conv_in.weight.detach().half().float().cpu().double()
     return f"{abs(int((weight.abs().sum() * 1e6).item())) % 16**6:06x}"

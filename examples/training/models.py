@@ -1,4 +1,4 @@
-"""Networks of the bundled prior, and the pipeline folder that they are saved as.
+"""Networks of the bundled prior, and saving them as a pipeline folder.
 
 Data flow: configuration -> VAE, U-Net, scheduler, text parts -> ``MarigoldDepthPipeline`` -> folder on disk.
 Paper: S3.1 (a latent diffusion prior of affine-invariant depth); sizes are ours.
@@ -34,7 +34,7 @@ _TEXT_WIDTH = 32
 def build_vae() -> AutoencoderKL:
     """A KL autoencoder of 0.65 M parameters: three blocks, 1/4 size, four latent channels.
 
-    It has no attention: a latent depends on its neighbourhood, and any size costs the same per pixel.
+    Without attention, a latent depends only on its neighbourhood, and the cost per pixel is constant.
     """
     return AutoencoderKL(
         in_channels=3,
@@ -53,7 +53,7 @@ def build_vae() -> AutoencoderKL:
 def build_unet() -> UNet2DConditionModel:
     """The denoiser, 5.4 M parameters: image latent and noisy depth latent in, v out.
 
-    Attention sits at the two lowest resolutions, where the whole picture fits in some 200 tokens.
+    Attention is used at the two lowest resolutions, where the image has about 200 tokens.
     """
     return UNet2DConditionModel(
         in_channels=8,
@@ -86,7 +86,7 @@ def build_scheduler() -> DDIMScheduler:
 
 
 def build_text() -> tuple[CLIPTextModel, CLIPTokenizer]:
-    """A text encoder and a tokenizer that only have to encode the empty prompt.
+    """Build a text encoder and a tokenizer for the empty prompt.
 
     Returns:
         One layer of width 32 with random weights, and a tokenizer over printable ASCII of length 77.
@@ -116,17 +116,17 @@ def assemble(
     steps: int = 1,
     resolution: int = 256,
 ) -> MarigoldDepthPipeline:
-    """The stock pipeline around the given parts.
+    """Assemble the stock pipeline from the given parts.
 
     Args:
         vae: autoencoder with its ``scaling_factor`` set.
         unet: denoiser.
         text: encoder and tokenizer from ``build_text`` or a loaded pipeline.
         steps: default number of denoising steps, >= 1.
-        resolution: default length of the longer side that is processed, in pixels, a multiple of 4.
+        resolution: default processing resolution: the longer side in pixels, a multiple of 4.
 
     Returns:
-        ``MarigoldDepthPipeline`` that shares the modules given, without a progress bar.
+        ``MarigoldDepthPipeline`` that uses the given modules, without a progress bar.
     """
     pipeline = MarigoldDepthPipeline(
         unet=unet,
@@ -145,11 +145,11 @@ def assemble(
 
 
 def save_prior(pipeline: MarigoldDepthPipeline, folder: str | Path) -> Path:
-    """Write the pipeline as float16 safetensors, replacing ``folder`` only when all of it is written.
+    """Write the pipeline as float16 safetensors, replacing ``folder`` once everything is written.
 
     Args:
-        pipeline: any dtype and device; it is left as it was.
-        folder: target; files beside diffusers' own (a model card) are kept.
+        pipeline: any dtype and device; not changed.
+        folder: target; files that diffusers does not write (a model card) are kept.
 
     Returns:
         The folder.
@@ -174,17 +174,17 @@ def save_prior(pipeline: MarigoldDepthPipeline, folder: str | Path) -> Path:
 
 
 def _half_copy(part: object) -> object:
-    """A float16 copy of a module on the CPU (text encoders in float32); anything else as it is."""
+    """A float16 copy of a module on the CPU (text encoders in float32); anything else unchanged."""
     if not isinstance(part, torch.nn.Module):
         return part
     if isinstance(part, CLIPTextModel):
         copy = type(part)(part.config)
-        # transformers loads in the dtype of the file, diffusers in float32: half would not meet the rest.
+        # transformers loads in the file's dtype and diffusers in float32, so float16 would not match.
         copy.load_state_dict({name: value.detach().cpu() for name, value in part.state_dict().items()})
         return copy.float().eval()
-    # from_config falls back to the class's default for what was a default when the module was built
-    # (scaling_factor), so the configuration is written once more.
-    # Names that start with an underscore say where it was loaded from, which is nobody's business.
+    # from_config uses the class's default for values that were defaults when the module was built
+    # (scaling_factor), so the configuration is written again.
+    # Names that start with an underscore hold the path it was loaded from.
     config = {key: value for key, value in part.config.items() if key[0] != "_"}
     copy = type(part).from_config(config)
     copy.register_to_config(**config)

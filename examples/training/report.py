@@ -1,4 +1,4 @@
-"""Reports of a training run: losses, held-out errors, a contact sheet, the prior so far.
+"""Reports of a training run: losses, held-out errors, a contact sheet, the current prior.
 
 Data flow: averaged weights -> pipeline folder, ``log.jsonl``, ``contact.png`` in the run's folder.
 """
@@ -24,10 +24,10 @@ _SHEET = 12
 
 
 class Reporter:
-    """Validates and saves from time to time.
+    """Validates and saves at intervals.
 
     Args:
-        options: of ``train.parse``.
+        options: from ``train.parse``.
         pipeline: holds the trained VAE and a U-Net that receives the averaged weights.
     """
 
@@ -37,12 +37,12 @@ class Reporter:
         self.mean_loss = float("nan")
 
     def loss(self, loss: torch.Tensor) -> None:
-        """Take one training loss into the running mean."""
+        """Add a training loss to the running mean."""
         value = float(loss.detach())
         self.mean_loss = value if self.mean_loss != self.mean_loss else 0.99 * self.mean_loss + 0.01 * value
 
     def due(self, progress: Progress) -> bool:
-        """Whether a report should be made now; never at the very start."""
+        """Return whether a report is due; never at the start."""
         every = 60 * self._options.validate_minutes
         if self._next is None:
             self._next = progress.seconds + every
@@ -55,8 +55,8 @@ class Reporter:
 
         Args:
             progress: counters for the log.
-            average: weights to judge.
-            divisor: the stage's least; scenes are processed at the largest size that it trains on.
+            average: weights to evaluate.
+            divisor: smallest divisor of the stage; scenes are processed at its largest training size.
             last: also try several steps.
 
         Returns:
@@ -82,7 +82,7 @@ class Reporter:
         return line
 
     def _scenes(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Held-out scenes, rendered once and kept in the run's folder."""
+        """Held-out scenes, rendered once and stored in the run's folder."""
         count = self._options.validation_scenes
         path = self._options.out / f"held_out_{count}.safetensors"
         if not path.exists():

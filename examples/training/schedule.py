@@ -1,6 +1,6 @@
-"""Training schedule: stages, learning rate and timesteps by the spent share of the time budget.
+"""Training schedule: stages, learning rate and timesteps by the spent fraction of the time budget.
 
-Data flow: fraction in [0, 1] -> learning rate, image size, share of pure regression; batch -> loss.
+Data flow: fraction in [0, 1] -> learning rate, image size, fraction of pure regression; batch -> loss.
 Paper: none; v-prediction with zero terminal signal-to-noise ratio, as Marigold v1-1.
 """
 
@@ -17,12 +17,12 @@ __all__ = ["Stage", "diffusion_loss", "draw_timesteps", "learning_rate", "stage_
 
 @dataclass(frozen=True)
 class Stage:
-    """One stretch of the training.
+    """One stage of the training.
 
     Attributes:
-        until: fraction of the budget where it ends, in (0, 1].
-        divisors: rendered images are shown at ``1 / divisor`` of their size, each in its turn, step by step.
-        last: share of samples at the last timestep, where the denoiser is a plain regression from the image.
+        until: fraction of the budget at which the stage ends, in (0, 1].
+        divisors: rendered images are used at ``1 / divisor`` of their size; steps cycle through the divisors.
+        last: fraction of samples at the last timestep, where the denoiser is a regression from the image.
     """
 
     until: float
@@ -30,13 +30,13 @@ class Stage:
     last: float
 
 
-# Full size alone unlearns half size within an hour, and a wide image is half size at any usual resolution.
+# With full size only, the prior loses accuracy at half size within an hour. Wide images need half size.
 SCRATCH = (Stage(0.45, (2,), 0.9), Stage(0.65, (2,), 0.5), Stage(1.0, (2, 1), 0.5))
 CONTINUED = (Stage(0.6, (2,), 0.8), Stage(1.0, (2, 1), 0.6))
 
 
 def stage_at(fraction: float, continued: bool) -> Stage:
-    """The stage at a spent fraction of the budget; a continued prior starts with the chain already learnt."""
+    """Return the stage at a spent fraction of the budget; a continued prior skips learning the chain."""
     stages = CONTINUED if continued else SCRATCH
     return next((stage for stage in stages if fraction < stage.until), stages[-1])
 
@@ -48,7 +48,7 @@ def learning_rate(top: float, fraction: float, step: int, warm_up: int = 300) ->
 
 
 def draw_timesteps(count: int, last: float, generator: torch.Generator, steps: int = 1000) -> torch.Tensor:
-    """Timesteps ``(count,)``: a share ``last`` at the end of the chain, more noisy than clean ones."""
+    """Timesteps ``(count,)``: a fraction ``last`` at the end of the chain, and more noisy than clean ones."""
     uniform = torch.rand(count, generator=generator)
     spread = (steps * (1.0 - uniform**1.5)).long().clamp(0, steps - 1)
     at_end = torch.rand(count, generator=generator) < last
@@ -64,9 +64,9 @@ def diffusion_loss(
     timesteps: torch.Tensor,
     noise: torch.Tensor,
 ) -> torch.Tensor:
-    """Squared plus half absolute error of the predicted v.
+    """Compute the squared error plus half the absolute error of the predicted v.
 
-    The absolute part makes the one-step answer a median, which keeps edges where a mean would blur them.
+    With the absolute error, the one-step prediction is a median, which keeps edges that a mean would blur.
 
     Args:
         unet: denoiser.

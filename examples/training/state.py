@@ -1,4 +1,4 @@
-"""State of a training run on disk, so that a killed run continues.
+"""State of a training run on disk, so that a killed run can resume.
 
 Data flow: U-Net, its moving average, AdamW moments, counters -> ``state.safetensors`` + ``state.json``
     -> the same.
@@ -24,8 +24,8 @@ class Progress:
     Attributes:
         step: optimiser steps of the U-Net.
         samples: scenes shown.
-        seconds: wall-clock spent in the U-Net's training, over all starts.
-        seed: of the run.
+        seconds: wall-clock time of the U-Net's training, over all starts.
+        seed: seed of the run.
     """
 
     step: int = 0
@@ -39,7 +39,7 @@ class Average:
 
     Args:
         module: the module to follow.
-        decay: weight of the past, in [0, 1).
+        decay: weight of the previous average, in [0, 1).
     """
 
     def __init__(self, module: torch.nn.Module, decay: float) -> None:
@@ -65,7 +65,7 @@ def store(
     optimiser: torch.optim.Optimizer,
     progress: Progress,
 ) -> None:
-    """Write the state; one rename makes it visible, so a kill in between leaves the one before."""
+    """Write the state; a rename makes it visible, so an interruption leaves the previous state."""
     tensors = {f"unet.{name}": value for name, value in unet.state_dict().items()}
     tensors |= {f"average.{name}": value for name, value in average.values.items()}
     for name, parameter in unet.named_parameters():
@@ -83,10 +83,10 @@ def store(
 def restore(
     folder: Path, unet: torch.nn.Module, average: Average, optimiser: torch.optim.Optimizer
 ) -> Progress | None:
-    """Read the state into the objects given.
+    """Load the state into the given objects.
 
     Returns:
-        The counters, or ``None`` when the folder holds no state.
+        The counters, or ``None`` if the folder has no state.
     """
     path = folder / "state.safetensors"
     if not path.exists():

@@ -1,4 +1,4 @@
-"""The mean of two priors' weights."""
+"""Averaging the weights of two priors."""
 
 import pytest
 import torch
@@ -18,14 +18,14 @@ def louder(tmp_path_factory):
     return save_prior(pipeline, folder)
 
 
-def test_share_says_where_between_the_two(louder, tmp_path):
-    main([str(BUNDLED_FOLDER), str(louder), "--share", "0.25", "--out", str(tmp_path / "mean")])
+def test_fraction_is_the_weight_of_the_second(louder, tmp_path):
+    main([str(BUNDLED_FOLDER), str(louder), "--fraction", "0.25", "--out", str(tmp_path / "mean")])
     first, mean = (open_pipeline(folder).unet.state_dict() for folder in (BUNDLED_FOLDER, tmp_path / "mean"))
     for name, value in first.items():
         torch.testing.assert_close(mean[name], 1.25 * value, rtol=2e-3, atol=1e-6)
 
 
-def test_other_autoencoder_is_refused(louder, tmp_path):
+def test_other_autoencoder_is_rejected(louder, tmp_path):
     pipeline = open_pipeline(louder)
     pipeline.vae.encoder.conv_in.weight.data += 0.1
     other = save_prior(pipeline, tmp_path / "other")
@@ -33,6 +33,6 @@ def test_other_autoencoder_is_refused(louder, tmp_path):
         blend(BUNDLED_FOLDER, other, 0.5)
 
 
-def test_share_is_checked():
-    with pytest.raises(ValueError, match="share must be between 0 and 1; got 1.5"):
+def test_fraction_is_checked():
+    with pytest.raises(ValueError, match="fraction must be between 0 and 1; got 1.5"):
         blend(BUNDLED_FOLDER, BUNDLED_FOLDER, 1.5)

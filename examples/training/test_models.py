@@ -52,11 +52,11 @@ def test_loss_vanishes_for_the_true_velocity():
     scheduler, generator = models.build_scheduler(), torch.Generator().manual_seed(0)
     image, depth, noise = (torch.randn(2, 4, 3, 3, generator=generator) for _ in range(3))
     timesteps = torch.tensor([999, 400])
-    truth = scheduler.get_velocity(depth, noise, timesteps)
+    ground_truth = scheduler.get_velocity(depth, noise, timesteps)
 
     def network(x, t, encoder_hidden_states, return_dict):
         assert x.shape == (2, 8, 3, 3) and encoder_hidden_states.shape == (2, 2, 32)
-        return (truth,)
+        return (ground_truth,)
 
     loss = schedule.diffusion_loss(network, scheduler, image, depth, torch.zeros(1, 2, 32), timesteps, noise)
     assert loss == 0.0

@@ -53,7 +53,7 @@ def test_scenes_are_scored_after_alignment_without_sky_and_far_pixels():
     assert oracle.asked == (3, 64)
 
 
-def test_contact_sheet_has_three_pictures_a_scene(tmp_path):
+def test_contact_sheet_has_three_images_per_scene(tmp_path):
     depth = torch.from_numpy(_ramp()).float()[None, None].repeat(4, 1, 1, 1)
     images, predictions = depth.repeat(1, 3, 1, 1) / 30.0, depth[:, 0].numpy().copy()
     depth[0, 0, 0, :] = float("inf")

@@ -1,4 +1,4 @@
-"""Distillation of a tiny autoencoder for the knob ``decoder``."""
+"""Distillation of a tiny autoencoder for the parameter ``decoder``."""
 
 import pytest
 import torch
@@ -86,7 +86,7 @@ def test_distillation_brings_the_student_to_its_teacher(cache, teacher):
     before = loss_of(build_tiny(teacher, 8))
     said = []
     after = loss_of(
-        train_tiny(teacher, cache, seconds=60, width=8, batch=4, rate=1e-2, steps=60, say=said.append)
+        train_tiny(teacher, cache, seconds=60, width=8, batch=4, rate=1e-2, steps=60, notify=said.append)
     )
     assert after < 0.6 * before
     assert not said  # fewer steps than a line takes

@@ -1,8 +1,8 @@
 """Train the small prior: ``python -m examples.training.train --out DIR --hours 6``.
 
 Data flow: rendered scenes -> autoencoder, then U-Net -> pipeline folder ``DIR/prior``; a killed run
-    continues.
-Paper: none; the recipe is Marigold's in small (README.md beside the weights).
+    resumes.
+Paper: none; a small version of Marigold's recipe (README.md next to the weights).
 """
 
 from __future__ import annotations
@@ -40,13 +40,11 @@ _AVERAGE_EVERY = 4
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
-    """The command line; see ``--help``."""
+    """Parse the command line; see ``--help``."""
     parser = argparse.ArgumentParser(prog="python -m examples.training.train", description=__doc__)
-    parser.add_argument(
-        "--out", type=Path, required=True, help="folder of the run; give it again to continue"
-    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the run; pass it again to resume")
     parser.add_argument("--cache", type=Path, help="rendered scenes; default OUT/cache")
-    parser.add_argument("--hours", type=float, default=6.0, help="wall-clock of the U-Net's training")
+    parser.add_argument("--hours", type=float, default=6.0, help="wall-clock hours of the U-Net's training")
     parser.add_argument("--vae-minutes", type=float, default=8.0)
     parser.add_argument("--vae-batch", type=int, default=4, help="crops per process and autoencoder step")
     parser.add_argument(
@@ -59,16 +57,18 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--rate", type=float, default=1e-3, help="top learning rate")
     parser.add_argument("--average", type=float, default=0.999, help="decay of the moving average")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--threads", type=int, default=0, help="of this process; torch's choice for 0")
-    parser.add_argument("--renderers", type=int, default=1, help="processes that fill the cache meanwhile")
-    parser.add_argument("--scenes", type=int, default=20_000, help="scenes in the cache, at most")
-    parser.add_argument("--first-scenes", type=int, default=256, help="wait for so many before the start")
+    parser.add_argument("--threads", type=int, default=0, help="threads of this process; 0: torch's default")
+    parser.add_argument("--renderers", type=int, default=1, help="background processes that fill the cache")
+    parser.add_argument("--scenes", type=int, default=20_000, help="maximum number of scenes in the cache")
     parser.add_argument(
-        "--fresh", action="store_true", help="render every batch on the device, keep none (GPU)"
+        "--first-scenes", type=int, default=256, help="number of scenes to wait for before the start"
+    )
+    parser.add_argument(
+        "--fresh", action="store_true", help="render every batch on the device without storing it (GPU)"
     )
     parser.add_argument("--validate-minutes", type=float, default=8.0)
     parser.add_argument("--validation-scenes", type=int, default=48)
-    parser.add_argument("--steps", type=int, help="a fixed number of U-Net steps instead of the hours")
+    parser.add_argument("--steps", type=int, help="a fixed number of U-Net steps instead of --hours")
     parser.add_argument("--vae-steps", type=int, help="a fixed number of autoencoder steps")
     return parser.parse_args(argv)
 
@@ -102,7 +102,7 @@ def run(options: argparse.Namespace) -> Progress:
 
 
 def _start_renderers(options: argparse.Namespace) -> list[subprocess.Popen]:
-    """Background processes that fill the cache; they stop when this process is gone."""
+    """Start background processes that fill the cache; they stop when this process ends."""
     command = [
         sys.executable,
         "-m",
@@ -185,14 +185,14 @@ def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
 
 
 class _Step:
-    """One optimiser step: draw a batch, its noise and timesteps, go down the gradient.
+    """One optimiser step: draws a batch, noise and timesteps, and descends the gradient.
 
     Args:
         network: the denoiser as prepared by accelerate.
         text: empty-prompt embedding ``(1, L, C)``.
-        options: of ``parse``.
+        options: from ``parse``.
         accelerator: device and processes.
-        step: of the run so far, so that a continued run draws anew.
+        step: current step of the run, so that a resumed run draws new samples.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class _Step:
         self.scheduler.alphas_cumprod = self.scheduler.alphas_cumprod.to(accelerator.device)
 
     def __call__(self, pool: LatentStore, stage: Stage, optimiser) -> tuple[torch.Tensor, int]:
-        """The loss and the number of scenes; half as many at full size as at low resolution."""
+        """Return the loss and the number of scenes; half as many at full size as at low resolution."""
         size = max(self.batch * pool.divisor // 2, 1)
         image, depth = (x.to(self.text.device) for x in pool.batch(size, self.generator))
         noise = torch.randn(depth.shape, generator=self.generator).to(depth.device)
@@ -223,7 +223,7 @@ class _Step:
 
 
 def _open_pool(divisor: int, options, vae, accelerator: Accelerator) -> LatentStore:
-    """The store of one resolution; what is small is kept mirrored too."""
+    """Open the store of one resolution; low resolutions also store mirrored scenes."""
     rank, world = accelerator.process_index, accelerator.num_processes
     variants = 2 if divisor == 2 else 1
     return LatentStore(options.cache, vae, divisor, variants, rank, world, fresh=options.fresh)

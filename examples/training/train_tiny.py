@@ -1,7 +1,7 @@
 """A tiny autoencoder of depth maps: ``python -m examples.training.train_tiny --help``.
 
-Data flow: crops of rendered depth -> the prior's autoencoder, which teaches -> ``AutoencoderTiny`` of the
-    same latent -> folder for the knob ``decoder``.
+Data flow: crops of rendered depth -> the prior's autoencoder (teacher) -> ``AutoencoderTiny`` with the
+    same latent -> folder for the parameter ``decoder``.
 Paper: none; the network is TAESD's (O. Boer Bohan, github.com/madebyollin/taesd), the loss is ours.
 """
 
@@ -20,16 +20,16 @@ from tqdm import tqdm
 from examples.training.data import normalise_disparity, read_shard, shards
 from examples.training.schedule import learning_rate
 from examples.training.train_vae import edge_error
-from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin._internal.checks import bad_value, check_number
 from geodiff_plugin.bundled import no_bars
 
 __all__ = ["build_tiny", "distillation_loss", "draw_maps", "main", "perturbed", "train_tiny"]
 
-#: Weight of the latents' squared error beside that of maps.
+#: Weight of the latents' squared error relative to the error of maps.
 _CODE = 0.2
-#: Share of the latents that is blurred.
+#: Fraction of the latents that are blurred.
 _BLURRED = 0.5
-#: Largest standard deviation of the noise that all of them get.
+#: Maximum standard deviation of the noise added to all latents.
 _NOISE = 0.2
 #: Side of a crop, pixels.
 _SIDE = 64
@@ -37,10 +37,10 @@ _SAY_EVERY = 500
 
 
 def build_tiny(vae: AutoencoderKL, width: int = 16) -> AutoencoderTiny:
-    """An untrained tiny autoencoder of the teacher's latent: two or three blocks a level, none at full size.
+    """Build an untrained tiny autoencoder for the teacher's latents: 2 or 3 blocks per level, 0 at full size.
 
     Args:
-        vae: teacher, whose levels and latent channels it gets.
+        vae: teacher; defines levels and latent channels.
         width: channels of every layer, >= 1.
     """
     levels = len(vae.config.block_out_channels)
@@ -55,19 +55,19 @@ def build_tiny(vae: AutoencoderKL, width: int = 16) -> AutoencoderTiny:
 
 
 def draw_maps(disparity: torch.Tensor, batch: int, side: int, generator: torch.Generator) -> torch.Tensor:
-    """Random crops of relative maps as guidance decodes and encodes them.
+    """Draw random crops of relative maps like the ones that guidance decodes and encodes.
 
-    A random power bends normalised inverse depth, so that maps of depth and of its logarithm are met too.
-    Half of them are turned around; range and offset vary, as those of early estimates do.
+    A random power of normalised inverse depth also covers maps of depth and log depth. Half of the maps
+    are inverted; range and offset vary, as in early estimates.
 
     Args:
         disparity: ``(N, 1, H, W)`` normalised inverse depth in [-1, 1].
         batch: number of crops.
-        side: of a crop, pixels; the image's where that is shorter.
+        side: side of a crop, pixels; at most the image's.
         generator: CPU generator.
 
     Returns:
-        ``(batch, 3, side, side)``, about [-1, 1]; the three channels are the same.
+        ``(batch, 3, side, side)``, about [-1, 1]; the three channels are equal.
     """
     side = min(side, *disparity.shape[-2:])
 
@@ -88,7 +88,7 @@ def draw_maps(disparity: torch.Tensor, batch: int, side: int, generator: torch.G
 
 
 def perturbed(codes: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Latents of unit spread as estimates of a clean latent are: a half blurred, all with a little noise."""
+    """Perturb latents of unit spread like estimates of a clean latent: half are blurred, all are noisy."""
     blurred = F.avg_pool2d(F.pad(codes, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
     one_each = (len(codes), 1, 1, 1)
     pick = torch.rand(one_each, generator=generator).to(codes.device) < _BLURRED
@@ -100,7 +100,7 @@ def perturbed(codes: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
 def distillation_loss(
     tiny: AutoencoderTiny, vae: AutoencoderKL, maps: torch.Tensor, generator: torch.Generator
 ) -> torch.Tensor:
-    """How far the student is from its teacher: in decoded maps, in latents, and in maps encoded and decoded.
+    """Compute the student's error relative to its teacher: decoded maps, latents, and reconstructed maps.
 
     Args:
         tiny: student, in training.
@@ -125,7 +125,7 @@ def distillation_loss(
 
 
 def _map_error(images: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Mean absolute error of the channels' mean, which is what a prior reads, and of its slopes."""
+    """Mean absolute error of the channels' mean, which a prior reads, and of its gradient."""
     error = images.mean(dim=1, keepdim=True) - target
     return error.abs().mean() + edge_error(error)
 
@@ -139,20 +139,20 @@ def train_tiny(
     rate: float = 3e-3,
     seed: int = 0,
     steps: int | None = None,
-    say: Callable[[str], None] = lambda line: None,
+    notify: Callable[[str], None] = lambda line: None,
 ) -> AutoencoderTiny:
-    """Distil a tiny autoencoder from a prior's own.
+    """Distil a tiny autoencoder from a prior's autoencoder.
 
     Args:
         vae: teacher, frozen; its device is used.
         cache: rendered shards, at least one.
         seconds: wall-clock budget, > 0.
         width: channels of the student.
-        batch: crops a step.
-        rate: top learning rate.
-        seed: of weights and crops.
+        batch: crops per step.
+        rate: maximum learning rate.
+        seed: seed of weights and crops.
         steps: a fixed number of steps instead of the budget.
-        say: takes a line on the progress every 500 steps.
+        notify: receives a progress line every 500 steps.
 
     Returns:
         The student, frozen.
@@ -162,8 +162,8 @@ def train_tiny(
     """
     have = shards(cache)
     if not have:
-        cure = "Fill it by `python -m examples.training.data --cache DIR --stop 64`."
-        bad_value("cache", "a folder with rendered shards", cache, cure)
+        hint = "Fill it by `python -m examples.training.data --cache DIR --stop 64`."
+        bad_value("cache", "a folder with rendered shards", cache, hint)
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     tiny = build_tiny(vae, width).to(vae.device).train()
@@ -184,7 +184,7 @@ def train_tiny(
         step += 1
         losses.append(loss.detach())
         if len(losses) == _SAY_EVERY:
-            say(f"step {step}, {100 * done:.0f} % done, loss {float(torch.stack(losses).mean()):.4f}")
+            notify(f"step {step}, {100 * done:.0f} % done, loss {float(torch.stack(losses).mean()):.4f}")
             losses.clear()
     return tiny.eval().requires_grad_(False)
 
@@ -192,11 +192,11 @@ def train_tiny(
 def main(argv: list[str] | None = None) -> None:
     """Command line; see ``--help``."""
     parser = argparse.ArgumentParser(prog="python -m examples.training.train_tiny", description=__doc__)
-    parser.add_argument("--prior", required=True, help="pipeline folder or hub id whose autoencoder teaches")
+    parser.add_argument("--prior", required=True, help="pipeline folder or hub id of the teacher autoencoder")
     parser.add_argument("--cache", type=Path, required=True, help="rendered scenes, see training.data")
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--minutes", type=float, default=20.0)
-    parser.add_argument("--steps", type=int, help="a fixed number of steps instead of the minutes")
+    parser.add_argument("--steps", type=int, help="a fixed number of steps instead of --minutes")
     parser.add_argument("--width", type=int, default=16, help="channels; 64 for an autoencoder of full size")
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--device", default="cpu")
@@ -215,7 +215,7 @@ def main(argv: list[str] | None = None) -> None:
         batch=options.batch,
         seed=options.seed,
         steps=options.steps,
-        say=tqdm.write,
+        notify=tqdm.write,
     )
     tiny.half().save_pretrained(options.out, safe_serialization=True)
 

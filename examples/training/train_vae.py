@@ -1,7 +1,7 @@
 """Training of the autoencoder on small crops of rendered images and depth maps.
 
 Data flow: shards -> crops -> ``AutoencoderKL`` with its ``scaling_factor`` set.
-Paper: none (the paper takes Stable Diffusion's autoencoder as it is).
+Paper: none (the paper uses Stable Diffusion's autoencoder).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _EDGE = 0.5
 
 
 class _Crops:
-    """Random crops of a few shards held in memory; half of a batch is images, half depth."""
+    """Random crops from a few shards in memory; half of a batch is images, half depth."""
 
     def __init__(self, cache: Path, keep: int = 40) -> None:
         self._cache, self._keep = cache, keep
@@ -65,17 +65,17 @@ class _Crops:
 
 
 def edge_error(difference: torch.Tensor) -> torch.Tensor:
-    """Weighted mean size of the slopes of a difference ``(N, C, H, W)``: what blurred edges cost."""
+    """Weighted mean gradient magnitude of a difference ``(N, C, H, W)``: penalizes blurred edges."""
     return _EDGE * sum(difference.diff(dim=axis).abs().mean() for axis in (-1, -2))
 
 
 def vae_loss(vae: AutoencoderKL, x: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
-    """Reconstruction (L1 and squared), slope of edges, and a weak pull of the latents to a unit Gaussian.
+    """Reconstruction (L1 and squared), gradients at edges, and a weak KL term towards a unit Gaussian.
 
     Args:
         vae: autoencoder in training.
         x: ``(N, 3, H, W)`` in [-1, 1].
-        generator: of the posterior sample.
+        generator: draws the posterior sample.
 
     Returns:
         Scalar.
@@ -89,7 +89,7 @@ def vae_loss(vae: AutoencoderKL, x: torch.Tensor, generator: torch.Generator | N
 
 
 class _Loss(torch.nn.Module):
-    """``vae_loss`` as a module's forward, which is what several processes can share."""
+    """``vae_loss`` as a module, for training with several processes."""
 
     def __init__(self, vae: AutoencoderKL) -> None:
         super().__init__()
@@ -110,16 +110,16 @@ def train_vae(
     rate: float = 2e-3,
     iterations: int | None = None,
 ) -> AutoencoderKL:
-    """Train the autoencoder, continue it, or load it when the run has finished it before.
+    """Train or resume the autoencoder, or load it if this run has already finished it.
 
     Args:
         folder: the run's folder; the result is ``vae.safetensors`` there.
         cache: rendered shards.
         accelerator: device, precision and processes.
         seconds: wall-clock budget.
-        seed: of crops and weights.
+        seed: seed of crops and weights.
         batch: crops in a batch of one process.
-        rate: top learning rate.
+        rate: maximum learning rate.
         iterations: a fixed number of iterations instead of the budget.
 
     Returns:
@@ -142,8 +142,10 @@ def train_vae(
     bar = tqdm(total=1000, desc="VAE", unit="permille", mininterval=10, disable=not first)
     while True:
         spent = base + time.monotonic() - start
-        share = torch.tensor(step / iterations if iterations else spent / max(seconds, 1e-6), device=device)
-        done = float(accelerator.reduce(share, "mean"))
+        fraction = torch.tensor(
+            step / iterations if iterations else spent / max(seconds, 1e-6), device=device
+        )
+        done = float(accelerator.reduce(fraction, "mean"))
         if done >= 1.0:
             break
         for group in optimiser.param_groups:
@@ -194,7 +196,7 @@ def finish_vae(vae: AutoencoderKL, cache: Path, most: int = 8) -> float:
 
 
 def save_vae(vae: AutoencoderKL, path: Path, seconds: float = 0.0) -> None:
-    """Write weights, scaling factor and seconds trained to one safetensors file, whole or not at all."""
+    """Write weights, scaling factor and training seconds to one safetensors file, atomically."""
     part = path.with_suffix(".part")
     numbers = {"scaling_factor": vae.config.scaling_factor, "seconds": seconds}
     tensors = {name: value.detach().cpu().contiguous() for name, value in vae.state_dict().items()}
@@ -203,7 +205,7 @@ def save_vae(vae: AutoencoderKL, path: Path, seconds: float = 0.0) -> None:
 
 
 def load_vae(path: Path, device: torch.device) -> AutoencoderKL:
-    """Read what ``save_vae`` wrote; frozen, in eval mode."""
+    """Load a file from ``save_vae``; frozen, in eval mode."""
     tensors = load_file(path)
     vae = build_vae()
     vae.register_to_config(scaling_factor=float(tensors.pop("scaling_factor")))

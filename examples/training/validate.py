@@ -46,7 +46,7 @@ def score_scenes(
     steps: int | None = None,
     resolution: int | None = None,
 ) -> tuple[float, float]:
-    """Mean aligned AbsRel and delta1 over rendered scenes; sky and what is beyond ``SCORED_M`` is left out.
+    """Mean aligned AbsRel and delta1 over rendered scenes; sky and depths beyond ``SCORED_M`` are excluded.
 
     Args:
         pipeline: the prior.
@@ -76,15 +76,15 @@ def contact_sheet(
     space: str,
     columns: int = 3,
 ) -> None:
-    """Image, truth and prediction side by side, one colour scale a scene, as a PNG.
+    """Write image, ground truth and prediction side by side as a PNG, with one colour scale per scene.
 
     Args:
         images_01: ``(N, 3, H, W)``.
         depth_m: ``(N, 1, H, W)`` metres, inf for sky.
         predictions: ``(N, H, W)`` relative depth.
-        path: file to write, replaced whole.
-        space: what the predictions are affine in, see ``alignment.align``.
-        columns: scenes in a row.
+        path: file to write atomically.
+        space: prediction space, see ``alignment.align``.
+        columns: scenes per row.
     """
     tiles = []
     for image, depth, prediction in zip(images_01, depth_m[:, 0].numpy(), predictions, strict=True):
@@ -92,9 +92,9 @@ def contact_sheet(
         low, high = np.quantile(depth[valid], [0.02, 0.98]) if valid.any() else (0.0, 1.0)
         fitted = align(prediction, depth, valid, space) if valid.sum() > 1 else prediction
         maps = [np.where(valid, depth, high), fitted]
-        pictures = [_colour((m - low) / max(high - low, 1e-6)) for m in maps]
+        images = [_colour((m - low) / max(high - low, 1e-6)) for m in maps]
         photo = (image.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-        tiles.append(np.concatenate([photo, *pictures], axis=1))
+        tiles.append(np.concatenate([photo, *images], axis=1))
     blank = np.full_like(tiles[0], 255)
     tiles += [blank] * (-len(tiles) % columns)
     rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
@@ -105,7 +105,7 @@ def contact_sheet(
 
 
 def _colour(unit: np.ndarray) -> np.ndarray:
-    """Near red, far blue, as diffusers colours Marigold's depth; ``(H, W, 3)`` uint8."""
+    """Colour depth as diffusers does for Marigold, near red and far blue; ``(H, W, 3)`` uint8."""
     import matplotlib
 
     table = matplotlib.colormaps["Spectral"]

@@ -1,9 +1,9 @@
-"""The arithmetic between a network's output, the clean latent and the noise, for every prediction type.
+"""Converts between network output, clean latent and noise for every prediction type.
 
 Eq. 6 (eq:tweedie) of Algorithm 1 divides by sqrt(alpha_bar), which is 0 at the first step of a
-zero-terminal-SNR schedule, and its sign fits a score, not noise. These are the formulas of the schedulers of
-diffusers, repeated: their ``step`` gives the clean latent only afterwards, some give none, and guidance needs
-its gradient. tests/parity/test_scheduler_parity.py compares them with every ``step``.
+zero-terminal-SNR schedule, and its sign applies to a score, not to noise. This module therefore repeats the
+formulas of the diffusers schedulers. Their ``step`` returns the clean latent too late or not at all, and
+guidance needs its gradient. tests/parity/test_scheduler_parity.py compares the formulas with every ``step``.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 
 PREDICTION_TYPES = ("epsilon", "sample", "v_prediction", "flow_prediction")
 
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """``z_t = alpha z_0 + sigma eps`` at one timestep; both 0-d float32, in [0, 1] and (0, 1].
+    """Noise level of one timestep, ``z_t = alpha z_0 + sigma eps``; 0-d float32 in [0, 1] and (0, 1].
 
-    The scheduler clamps ``z0_hat`` to ``[-clip, clip]``, unless ``clip`` is ``None``.
+    The scheduler clamps ``z0_hat`` to ``[-clip, clip]`` unless ``clip`` is ``None``.
     """
 
     alpha: Tensor
@@ -36,9 +36,9 @@ class NoiseLevel:
 
 
 def z0_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
-    """The clean latent that a network output implies, as the scheduler computes it.
+    """Compute the clean latent from a network output, as the scheduler does.
 
-    All latents are ``(B, C, h, w)``; differentiable in both tensors, except where the scheduler clips.
+    All latents are ``(B, C, h, w)``. Differentiable in both tensors except where the scheduler clips.
     """
     if level.prediction_type == "sample":
         z0 = output
@@ -52,7 +52,7 @@ def z0_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
 
 
 def noise_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
-    """The noise that a network output implies; shapes and dtype as ``z0_from``."""
+    """Compute the noise from a network output; shapes and dtype as in ``z0_from``."""
     if level.prediction_type == "epsilon":
         return output
     if level.prediction_type == "sample":
@@ -63,10 +63,10 @@ def noise_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
 
 
 def output_from(z0: Tensor, eps: Tensor, level: NoiseLevel) -> tuple[Tensor, Tensor]:
-    """The network output and noisy latent whose clean latent is ``z0`` and whose noise is ``eps``.
+    """Compute the network output and noisy latent that have the clean latent ``z0`` and the noise ``eps``.
 
-    Given these two, the ``step`` of any scheduler, multistep and stochastic ones included, continues from the
-    moved clean latent, without a second formula for z_{t-1}.
+    From these two, the ``step`` of any scheduler, including multistep and stochastic ones, continues from the
+    updated clean latent, so that no second formula for z_{t-1} is needed.
     """
     z_t = level.alpha * z0 + level.sigma * eps
     if level.prediction_type == "epsilon":

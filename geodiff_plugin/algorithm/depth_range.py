@@ -1,10 +1,10 @@
-"""Find the scale of a relative map (S7.3), in this order (``fit_depth_range``).
+"""Finds the scale of a relative map (S7.3) in this order (``fit_depth_range``).
 
-1. ``search_scale``: near and far by lookup in the cost volume, at the first step, or at every step if too
-   few matches are reliable; without a right view ``fit_to_points`` instead.
-2. ``refine_to_matches``, then ``fit_to_points`` on reliable matches: choose among the search's minima.
-3. ``refine_to_matches``: fit within that minimum, first to the matches, then to the points.
-4. ``ordered``: near stays below far, and both within a given range.
+1. ``search_scale`` looks near and far up in the cost volume, at the first step, or at every step if too few
+   matches are reliable. Without a right view ``fit_to_points`` is used instead.
+2. ``refine_to_matches``, then ``fit_to_points`` on reliable matches, choose among the minima of the search.
+3. ``refine_to_matches`` fits within that minimum, first to the matches, then to the points.
+4. ``ordered`` keeps near below far; both are clamped to a given range.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from torch import Tensor
 from geodiff_plugin.algorithm.terms import Given, Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.scale.affine import AffineState
 from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refine_to_matches
-from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, smooth_floor
+from geodiff_plugin.scale.space import DepthRange, MetricMap, smooth_floor
 from geodiff_plugin.scale.volume_search import search_scale
 
 
 def span_of_points(evidence: Sequence[Evidence]) -> DepthRange:
-    """The nearest and the farthest point of every sample; all samples have points."""
+    """Return the nearest and the farthest point of every sample; all samples have points."""
     spans = [depth_span(points) for sample in evidence if (points := sample.points) is not None]
     nearest, farthest = map(torch.stack, zip(*spans, strict=True))
     return DepthRange(nearest, farthest, torch.zeros_like(nearest, dtype=torch.bool))
@@ -31,7 +32,7 @@ def span_of_points(evidence: Sequence[Evidence]) -> DepthRange:
 
 @torch.no_grad()
 def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Tensor]:
-    """The g_s of least photometric loss at the paper's s_hat = t_hat = 0, and whether it is on the edge."""
+    """Find the g_s of least photometric loss at s_hat = t_hat = 0, and whether it is on the range's edge."""
     config, zero = objective.config, x.new_zeros(x.shape[0])
     low, high = config.g_s_range
     candidates = torch.linspace(low, high, config.g_s_candidates, dtype=torch.float32, device=x.device)
@@ -39,7 +40,7 @@ def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Ten
     def cost(g_s: Tensor) -> Tensor:
         affine = AffineState(zero, zero, g_s.expand_as(zero))
         loss = objective(x, Given(affine, affine, zero.view(-1, 1), zero.view(-1, 1)))
-        # A scene that no right camera sees costs nothing, and must not win.
+        # A scene outside every right view has zero loss and must not win.
         shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= config.min_visible)
         return loss.terms["photometric"].where(shown, torch.inf)
 
@@ -55,10 +56,10 @@ def fit_depth_range(
     current: DepthRange | None = None,
     valid: Tensor | None = None,
 ) -> DepthRange:
-    """The depth range of one image's maps ``x (B, 1, h, w)`` that its views and points agree on best.
+    """Fit the depth range of one image's maps ``x (B, 1, h, w)`` to its views and points.
 
-    The ``current`` range, whose ``on_edge`` is ``None`` before the first search, stays unless a better basin
-    shows up. Only pixels that are ``valid (1, 1, h, w)`` are compared.
+    The ``current`` range, whose ``on_edge`` is ``None`` before the first search, is kept unless a better
+    basin is found. Only ``valid (1, 1, h, w)`` pixels are compared.
     """
     space, floored, reliable = metric.space, smooth_floor(x), evidence.reliable
     on_edge: Tensor | None
@@ -67,14 +68,14 @@ def fit_depth_range(
         near, far = fit_to_points(x, evidence.points, metric, None if current is None else current[:2])
         on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
     elif current is not None and reliable is not None and current.on_edge is not None:
-        # Later steps start from the first one's range; reliable matches show if that basin is still best.
+        # Later steps start from the first step's range; reliable matches show if its basin is still the best.
         near, far, on_edge = current.near_m, current.far_m, current.on_edge
     else:
         near, far, on_edge = search_scale(
             evidence.volume, floored, space, depth_range=config.depth_range, current=current, valid=valid
         )
     if reliable is not None and evidence.matches is not None:
-        # A poor prior's true basin is shallow in raw costs; matches separate basins at that error.
+        # For a poor prior the true basin is shallow in raw costs, but matches still separate the basins.
         near, far = refine_to_matches(floored, evidence.matches, near, far, space)
         near, far = fit_to_points(x, reliable, metric, (near, far))
     for target in (evidence.matches, evidence.points):

@@ -1,4 +1,4 @@
-"""``Trajectory``: scale, shift and g_s, optimisers and matches of a chunk of samples, step by step."""
+"""``Trajectory``: scale, shift, g_s, optimizers and matches of a chunk of samples, step by step."""
 
 from __future__ import annotations
 
@@ -13,69 +13,80 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.correction import correction_target, fit_depth, local_error, prior_error
 from geodiff_plugin.algorithm.depth_range import fit_depth_range, search_one_number, span_of_points
-from geodiff_plugin.algorithm.gradients import RULES, SUMMED, FiniteWatch
+from geodiff_plugin.algorithm.match_fitting import fit_depth, fit_target, local_error, prior_error
 from geodiff_plugin.algorithm.member import Member
+from geodiff_plugin.algorithm.optimizers import OPTIMIZERS, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.terms import Given, Loss, Objective
+from geodiff_plugin.cameras import PosedViews, valid_pixels
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.geometry import resize_image, stacked
 from geodiff_plugin.matching import Matches, reject_reflections
+from geodiff_plugin.matching.repetition import settle
+from geodiff_plugin.scale.affine import AffineState
 from geodiff_plugin.scale.points import order_agreement
-from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, PriorMaps, joined
-from geodiff_plugin.types import CameraView, PosedViews, StepReport
+from geodiff_plugin.scale.space import DepthRange, MetricMap, PriorMaps, cat_samples
+from geodiff_plugin.types import StepReport
 
 
 def _samples_of_images(image_of_sample: Sequence[int]) -> list[slice]:
-    """The samples of every image, which lie side by side."""
+    """Return the samples of every image as slices; samples of one image are consecutive."""
     counts = [len(list(samples)) for _, samples in groupby(image_of_sample)]
     return [slice(last - count, last) for count, last in zip(counts, accumulate(counts), strict=True)]
 
 
-def chunk_views(evidence: Sequence[Evidence]) -> PosedViews:
-    """The views of every sample of a chunk on the grid of the evidence, images and K of one size.
+def chunk_views(evidence: Sequence[Evidence]) -> list[PosedViews]:
+    """Return the views of every sample of a chunk on the evidence grid, equal in number and size.
 
-    An image with fewer views than another repeats its first one: the terms take the best view of each pixel,
+    An image with fewer views than another repeats its first one. The terms use the best view of each pixel,
     so repetition changes nothing.
     """
     grids = [image.grid for image in evidence]
-    further = []
-    for v in range(max(len(grid.views) for grid in grids)):
-        views = [grid.views[v if v < len(grid.views) else 0] for grid in grids]
-        height, width = (max(view.image_01.shape[axis] for view in views) for axis in (-2, -1))
-        sized = [resize_image(image, K, (height, width)) for image, K, _ in views]
-        images, Ks = (stacked(each) for each in zip(*sized, strict=True))
-        further.append(CameraView(images, Ks, stacked([view.T_right_from_left for view in views])))
-    left_01, K_left = (stacked([getattr(g, name) for g in grids]) for name in ("left_01", "K_left"))
-    return PosedViews(left_01, tuple(further), K_left)
+    columns = []
+    for v in range(max(len(grid.rights) for grid in grids)):
+        views = [grid.rights[v if v < len(grid.rights) else 0] for grid in grids]
+        height, width = (max(view.size[axis] for view in views) for axis in (0, 1))
+        columns.append([view.resized((height, width)) for view in views])
+    rights = zip(*columns, strict=True) if columns else [()] * len(grids)
+    return [PosedViews(grid.left, tuple(views)) for grid, views in zip(grids, rights, strict=True)]
+
+
+def _valid_maps(valid: Tensor | None, evidence: Sequence[Evidence]) -> Tensor | None:
+    """Return where the prior gives a depth and the left image is valid, ``(B, 1, h, w)`` bool."""
+    images = valid_pixels([sample.grid.left for sample in evidence])
+    if images is None:
+        return valid
+    if valid is None:
+        return images
+    return F.interpolate(valid.float(), images.shape[-2:], mode="nearest-exact").bool() & images
 
 
 class StepTime(NamedTuple):
-    """Which denoising step it is."""
+    """Index and timestep of a denoising step."""
 
-    number: int  # in the schedule, from 0
-    timestep: float  # the scheduler's
+    number: int  # index in the schedule, from 0
+    timestep: float  # of the scheduler
 
 
 class Trajectory:
-    """State of one chunk of samples through the schedule.
+    """State of one chunk of samples throughout the schedule.
 
     Args:
         config: the hyperparameters.
-        evidence: of every image of the call.
-        image_of_sample: the image of each sample of the chunk; those of one image lie side by side.
-        maps: what is known of the prior's maps.
-        step_latents: size of a gradient update of the latent.
+        evidence: evidence of every image of the call.
+        image_of_sample: image index of each sample of the chunk; samples of one image are consecutive.
+        maps: known properties of the prior's maps.
+        lr_latents: step size of a gradient update of the latent.
     """
 
     affine: AffineState  # after the latest update; set by ``find_scale``
-    reflection_weight: Tensor | None = None  # (B, 1, H, W), factor on the confidence of matches
-    error: Tensor | None = None  # (B, 1, 1, 1), ``correction.prior_error`` of the first estimate
-    hidden: Tensor | None = None  # (B, V, 1, H, W) bool, what the estimate hides from the right cameras
+    match_weight: Tensor | None = None  # (B, 1, H, W), factor on the confidence of matches
+    certainty: Tensor | None = None  # (B, 1, H, W), ``Settled.certainty`` of the first estimate
+    error: Tensor | None = None  # (B, 1, 1, 1), ``match_fitting.prior_error`` of the first estimate
+    occluded: Tensor | None = None  # (B, V, 1, H, W) bool, pixels occluded in the right views
     rank_correlation: Tensor | None = None  # (B,), of the prior's first map with matches or points
     prior_depth_m: Tensor | None = None  # (B, 1, h, w) metres, a metric prior's first estimate
-    on_edge: Tensor | None = None  # (B,) bool, whether the last search ended on the edge of its range
+    on_edge: Tensor | None = None  # (B,) bool, whether the last search ended at the edge of its range
 
     def __init__(
         self,
@@ -83,41 +94,43 @@ class Trajectory:
         evidence: Sequence[Evidence],
         image_of_sample: Sequence[int],
         maps: PriorMaps,
-        step_latents: float = 0.0,
+        lr_latents: float = 0.0,
     ) -> None:
-        self.config, self.maps = config, maps
-        self.evidence = [evidence[image] for image in image_of_sample]  # of each sample
+        self.evidence = [evidence[image] for image in image_of_sample]  # one per sample
+        self.config, self.maps = config, replace(maps, valid=_valid_maps(maps.valid, self.evidence))
         self.metric = MetricMap(maps.space, config.positive)
         self.objective = Objective(chunk_views(self.evidence), self.metric, config)
         self.matches = Matches.stack([e.matches for e in self.evidence])
         self.points = Matches.stack([e.points for e in self.evidence])
-        pixels = math.prod(self.objective.views.size) if config.rule == SUMMED else 1
-        self.latent_rule = RULES[config.rule](step_latents * pixels)
-        self.scale_rule, self.shift_rule = (RULES[config.rule](config.step_affine) for _ in range(2))
+        pixels = math.prod(self.objective.size) if config.optimizer == SUMMED else 1
+        self.latent_optimizer = OPTIMIZERS[config.optimizer](lr_latents * pixels)
+        self.scale_optimizer, self.shift_optimizer = (
+            OPTIMIZERS[config.optimizer](config.lr_affine) for _ in range(2)
+        )
         self._images = _samples_of_images(image_of_sample)
-        self._affine_start: AffineState | None = None  # the search's result, which the loss pulls towards
+        self._affine_start: AffineState | None = None  # search result, target of the affine regularization
         self.history: list[StepReport] = []
         self.watch = FiniteWatch()
         self.step = StepTime(0, 0.0)
 
-    def note(self, name: str, tensor: Tensor) -> None:
-        """Remember whether a tensor of this step is finite."""
-        self.watch.note(name, self.step.number, tensor)
+    def record(self, name: str, tensor: Tensor) -> None:
+        """Record whether a tensor of this step is finite."""
+        self.watch.record(name, self.step.number, tensor)
 
     def prepare(self, x: Tensor, z0: Tensor) -> None:
-        """Find the scale of an estimate ``x``, decoded from ``z0``; at the first one judge the matches."""
-        self.note("the network's clean latent", z0)
-        self.note("the decoded map", x)
+        """Find the scale of an estimate ``x``, decoded from ``z0``; the first call also assesses matches."""
+        self.record("the network's clean latent", z0)
+        self.record("the decoded map", x)
         if self.maps.depth_range is not None and self.prior_depth_m is None:
             near_m, far_m, _ = self.maps.depth_range
             self.prior_depth_m = self.metric(x, self.metric.from_range(near_m, far_m))
         if self.rank_correlation is None:
             self.rank_correlation = self._rank_correlation(x)
         self.find_scale(x)
-        self._judge_matches(x)
+        self._assess_matches(x)
 
     def find_scale(self, x: Tensor) -> None:
-        """Search g_s and the start of scale and shift for a relative map (S7.3), or improve those in use."""
+        """Search g_s and the initial scale and shift of a relative map (S7.3), or refine the current ones."""
         is_first = self._affine_start is None
         if self.config.search == "volume":
             current = self.maps.depth_range
@@ -134,49 +147,52 @@ class Trajectory:
             self.affine = self._affine_start = start
 
     def _fitted_range(self, x: Tensor, current: DepthRange | None) -> DepthRange:
-        """``fit_depth_range`` of every image."""
+        """Run ``fit_depth_range`` for every image."""
         ranges = []
-        for samples, judged in zip(self._images, self._judged, strict=True):
+        for samples, evidence in zip(self._images, self._valid_evidence, strict=True):
             before = None if current is None else current.of(samples)
             valid = None if self.maps.valid is None else self.maps.valid[samples][:1]
-            ranges.append(fit_depth_range(x[samples], judged, self.metric, self.config, before, valid))
-        near_m, far_m, on_edge = (joined(values) for values in zip(*ranges, strict=True))
+            ranges.append(fit_depth_range(x[samples], evidence, self.metric, self.config, before, valid))
+        near_m, far_m, on_edge = (cat_samples(values) for values in zip(*ranges, strict=True))
         return DepthRange(near_m, far_m, on_edge)
 
     @cached_property
-    def _judged(self) -> list[Evidence]:
-        """What the prior is compared with: the evidence of every image where the prior gives a depth."""
+    def _valid_evidence(self) -> list[Evidence]:
+        """Evidence of every image, restricted to pixels with a prior depth."""
         firsts, valid = [samples.start for samples in self._images], self.maps.valid
         if valid is None:
             return [self.evidence[first] for first in firsts]
         return [self.evidence[first].within(valid[first]) for first in firsts]
 
     def _rank_correlation(self, x: Tensor) -> Tensor:
-        """Rank correlation ``(B,)`` of the prior alone with matches or points; NaN without enough of them."""
+        """Compute the rank correlation ``(B,)`` of the prior with matches or points; NaN for too few."""
         correlations = []
-        for samples, judged in zip(self._images, self._judged, strict=True):
-            target, of_image = judged.matches or judged.points, x[samples]
+        for samples, evidence in zip(self._images, self._valid_evidence, strict=True):
+            target, of_image = evidence.matches or evidence.points, x[samples]
             if target is None:
                 correlations.append(x.new_full((len(of_image),), torch.nan))
             else:
                 correlations.append(order_agreement(of_image, target, self.metric.space))
-        return joined(correlations)
+        return cat_samples(correlations)
 
-    def _judge_matches(self, x: Tensor) -> None:
-        """At the first estimate: find matches that look like reflections, and measure the prior's error."""
+    def _assess_matches(self, x: Tensor) -> None:
+        """At the first estimate, find matches that look like reflections and measure the prior's error."""
         if self.error is not None or (self.matches is None and self.points is None):
             return
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
-        if self.matches is not None and self.reflection_weight is None:
-            self.reflection_weight = self._weight_by_reflections(self.matches, depth_m)
-        if self.config.correct or self.config.crisp:
+        if self.matches is not None and self.match_weight is None:
+            self.match_weight = self._weight_by_reflections(self.matches, depth_m)
+            if (settled := settle(self.matches, depth_m)) is not None:
+                self.match_weight = self.match_weight * settled.weight
+                self.certainty = settled.certainty
+        if self.config.fit_matches or self.config.refine_edges:
             target = self._target(depth_m)
             assert target is not None  # there are matches or points
             target = target if self.maps.valid is None else target.within(self.maps.valid)
-            self.error = prior_error(depth_m, target, self.objective.views.left_01, self.config)
+            self.error = prior_error(depth_m, target, self.objective.left_01, self.config)
 
     def _weight_by_reflections(self, matches: Matches, depth_m: Tensor) -> Tensor:
-        """The factor ``(B, 1, H, W)`` on the confidence of matches that removes reflections."""
+        """Return the factor ``(B, 1, H, W)`` on the confidence of matches that removes reflections."""
         if not self.config.reject_reflections:
             return torch.ones_like(depth_m)
         valid = self.maps.valid
@@ -188,37 +204,37 @@ class Trajectory:
 
     def _target(self, depth_m: Tensor) -> Matches | None:
         error = local_error(self.error, self.maps.valid)
-        return correction_target(self.matches, self.points, self.reflection_weight, error, depth_m)
+        return fit_target(self.matches, self.points, self.match_weight, error, depth_m)
 
-    def find_hidden(self, x: Tensor) -> None:
-        """Find the pixels that a map hides from the right cameras, for all updates of a round."""
-        compared = self.config.weights.get("photometric") and self.objective.views.views
-        if self.config.z_test and compared:
-            self.hidden = self.objective.hidden(x, self.affine)
+    def find_occluded(self, x: Tensor) -> None:
+        """Find the pixels of a map that are occluded in the right views, for all updates of a round."""
+        compared = self.config.weights.get("photometric") and self.objective.rights_01
+        if self.config.occlusion_mask and compared:
+            self.occluded = self.objective.occluded(x, self.affine)
 
     @torch.no_grad()
-    def corrected(self, x: Tensor) -> Tensor:
-        """A relative map ``x (B, 1, h, w)`` fitted to matches and points; ``x`` where there are neither."""
+    def fitted(self, x: Tensor) -> Tensor:
+        """Fit a relative map ``x (B, 1, h, w)`` to matches and points; returns ``x`` if there are none."""
         depth_m = self.objective.metric_depth(x, self.affine)
         target, error = self._target(depth_m), local_error(self.error, self.maps.valid)
         if target is None or error is None:
             return x
-        fit = fit_depth(depth_m, target, self.objective.views.left_01, error, self.config)
-        # Resample the factor, not the difference of maps, which would be wrong on both sides of an edge.
-        change = F.interpolate(fit.correction, x.shape[-2:], mode="bilinear", antialias=True)
+        fit = fit_depth(depth_m, target, self.objective.left_01, error, self.config)
+        # Resample the factor: a resampled difference of maps would be wrong on both sides of an edge.
+        change = F.interpolate(fit.log_change, x.shape[-2:], mode="bilinear", antialias=True)
         return self.metric.relative(self.metric(x, self.affine) * torch.exp(-change), self.affine)
 
     def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:
-        """Loss of an estimate ``x``, decoded from ``z0``, whose scale is known; as ``Objective``."""
-        assert self._affine_start is not None  # of find_scale
-        matches = None  # less those that look like reflections
-        if self.matches is not None and self.reflection_weight is not None:
-            matches = replace(self.matches, confidence=self.reflection_weight * self.matches.confidence)
-        start, points, hidden = self._affine_start, self.points, self.hidden
-        return self.objective(x, Given(affine, start, z0, anchor, matches, points, hidden))
+        """Compute the loss of an estimate ``x`` with known scale, decoded from ``z0`` (``Objective``)."""
+        assert self._affine_start is not None  # set by find_scale
+        matches = None  # without reflections
+        if self.matches is not None and self.match_weight is not None:
+            matches = replace(self.matches, confidence=self.match_weight * self.matches.confidence)
+        start, points, occluded = self._affine_start, self.points, self.occluded
+        return self.objective(x, Given(affine, start, z0, anchor, matches, points, occluded))
 
     def report(self, loss: Loss | None) -> None:
-        """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
+        """Append a ``StepReport``; tensors stay on their device, so that nothing synchronizes."""
         report = StepReport(*self.step, self.affine.s_hat, self.affine.t_hat, self.affine.g_s)
         if loss is not None:
             terms = {name: value.detach() for name, value in loss.terms.items()}
@@ -227,15 +243,16 @@ class Trajectory:
         self.history.append(report)
 
     def result(self, x: Tensor) -> Tensor:
-        """Metric depth ``(B, 1, H, W)`` of the maps of the final latents, on the padded grid."""
-        self.note("the map of the final latent", x)
+        """Return the metric depth ``(B, 1, H, W)`` of the final latents' maps, on the padded grid."""
+        self.record("the map of the final latent", x)
         return self.metric(x, self.affine)
 
     def members(self, x: Tensor, depth_m: Tensor) -> list[Member]:
-        """What act 3 gets of every sample: of the maps ``x`` without padding, and of their ``result``."""
+        """Make the members for act 3 from the maps ``x`` without padding and from their ``result``."""
         near_m, far_m = (end.view(-1, 1, 1, 1) for end in depth_m.flatten(1).aminmax(dim=1))
         measured = {
-            "reflection_weight": self.reflection_weight,
+            "match_weight": self.match_weight,
+            "certainty": self.certainty,
             "error": self.error,
             "valid": self.maps.valid,
             "rank_correlation": self.rank_correlation,

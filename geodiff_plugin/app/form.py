@@ -1,107 +1,130 @@
-"""Input fields of the page, and pairs to try it with."""
+"""Input fields of the page, and example pairs."""
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass, fields
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import gradio as gr
 
-from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.app import look
-from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, CameraFields, Priors, options_of, photograph_size
-from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, REAL_PAIRS_FOLDER
-from geodiff_plugin.formats.reading import CALIBRATION_FORMATS
-from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.options import PRESETS, help_of
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.app import results, templates
+from geodiff_plugin.app.job import (
+    CAMERA_INPUTS,
+    EXAMPLES,
+    FOCAL_INPUTS,
+    GUESSES,
+    LIMITS,
+    NO_POSELIB,
+    SCALE_INPUTS,
+    CameraFields,
+    Priors,
+    Request,
+    can_estimate,
+    image_size,
+    pair_name,
+    request_of,
+    states_focal_length,
+)
+from geodiff_plugin.app.lenses import LENSES
+from geodiff_plugin.app.messages import Message, PageError, error_on_page
+from geodiff_plugin.formats import CALIBRATION_FORMATS, in_8_bits, read_image
+from geodiff_plugin.options import RunOptions
+from geodiff_plugin.settings import settings_of
 
-PICTURE_HEIGHT = 130
+IMAGE_HEIGHT = 130
 CALIBRATION_HEIGHT = 104
-#: Short, as it stands in a field of half a phone's width.
+#: Short, because the field is half as wide as a phone.
 DROP_HERE = "Drop or choose"
-#: Of handlers that only the page itself calls.
+#: Options of handlers that only the page calls.
 QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
-#: Of taps that come at once every one counts, after the one before.
+#: Options of handlers of changes: after several quick ones, the last one is handled.
+LAST = QUICK | {"trigger_mode": "always_last"}
+#: Options of handlers of taps: each of several quick taps is handled, in order.
 TAPS = QUICK | {"queue": True, "concurrency_limit": 1, "trigger_mode": "multiple"}
-#: Labels of the fields that hold a number or nothing.
+#: Labels of the optional number fields.
 NUMBERS = {
     "fx": "fx, px",
     "fy": "fy, px",
     "cx": "cx, px",
     "cy": "cy, px",
     "cx_right": "Right camera's cx, px",
+    "fov": "Horizontal field of view, degrees",
     "baseline": "Distance between the cameras, m",
-    "known_length": "Or a known length in the left photograph, m",
+    "baseline_error": "Accurate to ±, m",
+    "known_length": "Known length, m",
     "near": "Nearest depth, m",
     "far": "Farthest depth, m",
 }
-PAIRS_FOLDER = Path(__file__).resolve().parent / "pairs"
-
-
-@dataclass(frozen=True)
-class Example:
-    """A pair to try the page with: its folder, how its images end, and what the page calls it."""
-
-    folder: Path
-    ending: str
-    label: str
-
-    @property
-    def left(self) -> Path:
-        """The left image."""
-        return self.folder / f"left.{self.ending}"
-
-
-#: Real pairs first; ``tests.scenes.make_examples`` renders the others anew.
-EXAMPLES = (
-    Example(REAL_PAIRS_FOLDER / "toy", "png", "Playroom"),
-    Example(REAL_PAIRS_FOLDER / "cycles", "png", "Hallway"),
-    Example(REAL_PAIRS_FOLDER / "donkey_toy", "png", "Bedroom"),
-    Example(DEMO_PAIR_FOLDER, "png", "Desk"),
-    Example(PAIRS_FOLDER / "street", "jpg", "Street"),
-)
+#: Fields that accept a unit, such as "12 cm".
+LENGTHS = ("baseline", "baseline_error", "known_length", "near", "far")
+_METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
+#: Placeholder of the distance between the cameras, by source of the cameras.
+BASELINE_PLACEHOLDERS = {"file": "from the file", "numbers": "required", "images": "such as 12 cm"}
 
 
 @dataclass(frozen=True)
 class Form:
-    """The components, ``fields`` by the name of what they fill in, and the values that they begin with."""
+    """Components of the form, ``fields`` by option name, and their initial values."""
 
     fields: dict[str, Any]
-    untouched: dict[str, Any]
+    initial: dict[str, Any]
     run: gr.Button
     stop: gr.Button
 
-    def options(self, values: tuple[Any, ...]) -> DepthOptions:
-        """What was filled in."""
+    def request(self, values: tuple[Any, ...]) -> Request:
+        """Return what a visitor asks for with these values of the fields.
+
+        Raises:
+            InputError: A field is missing or wrong.
+        """
         named = dict(zip(self.fields, values, strict=True))
-        for name, label in NUMBERS.items():
-            named[name] = _number(named[name], label)
+        for name in NUMBERS:
+            named[name] = _number(named[name], name)
         named["lens"] = {name: named.pop(name) for name in ("fx", "fy", "cx", "cy")}
         named |= {name: int(named[name] or 0) for name in ("steps", "ensemble", "resolution", "seed")}
-        named |= {name: named[name] or None for name in ("steps", "resolution")}  # 0: the prior's own
+        named |= {name: named[name] or None for name in ("steps", "resolution")}  # 0: the prior's default
         named["calib"] = tuple(named["calib"] or ())
         cameras = CameraFields(**{field.name: named.pop(field.name) for field in fields(CameraFields)})
-        return options_of(cameras=cameras, **named)
+        return request_of(cameras=cameras, **named)
+
+    def name(self, values: tuple[Any, ...]) -> str:
+        """Return a name for these values of the fields, before they are checked."""
+        named = dict(zip(self.fields, values, strict=True))
+        paths = [Path(named[side]) for side in ("left", "right") if named[side]]
+        if len(paths) == 2 and all(path.is_file() for path in paths):
+            return pair_name(*paths)
+        return " and ".join(path.name for path in paths) or "without images"
 
     def example(self, number: int) -> list[Any]:
-        """A value for every field: the files of an example, and all others as they began."""
-        folder, ending = EXAMPLES[number].folder, EXAMPLES[number].ending
-        files: dict[str, Any] = {side: str(folder / f"{side}.{ending}") for side in ("left", "right")}
-        files["calib"] = [str(folder / "calib.txt")]
-        return list((self.untouched | files).values())
+        """Return a value per field: the files of an example, and the initial values of all others."""
+        example = EXAMPLES[number]
+        files: dict[str, Any] = {side: str(getattr(example, side)) for side in ("left", "right")}
+        files |= {"calib": [str(example.folder / "calib.txt")], "camera_input": "file"}
+        return list((self.initial | files).values())
 
 
-def _number(text: str | None, label: str) -> float | None:
-    """The number of an optional field, or ``None``; a number field of gradio shows 0 where it is empty."""
+def _number(text: str | None, name: str) -> float | None:
+    """Return the number of an optional text field, or ``None``; gradio's number field shows 0 if empty."""
     if text is None or not text.strip():
         return None
+    match = re.fullmatch(r"([-+]?[\d.]+(?:e[-+]?\d+)?)\s*(mm|cm|m)?", text.strip().replace(",", ".").lower())
     try:
-        return float(text.replace(",", "."))
+        value = float(match[1]) if match else math.nan
     except ValueError:
-        bad_value(label, "a number", repr(text), "Leave it empty if you do not know it.")
+        value = math.nan
+    unit = (match[2] or "") if match else ""
+    if not math.isfinite(value) or (unit and name not in LENGTHS):
+        example = "such as 0.12 or 12 cm" if name in LENGTHS else "such as 812.5"
+        raise PageError(
+            f"{NUMBERS[name]}: enter a number {example}, not {text.strip()[:40]!r}. Clear the field if you "
+            "do not know it."
+        )
+    return value * _METRES[unit]
 
 
 def _optional(name: str, placeholder: str, **more: Any) -> gr.Textbox:
@@ -111,109 +134,182 @@ def _optional(name: str, placeholder: str, **more: Any) -> gr.Textbox:
 
 
 def _path_of(payload: Any) -> str | None:
-    """The path of what was dropped, which nothing opens before us."""
+    """Return the path of the dropped file, without opening it."""
     return None if payload is None else payload.path
 
 
-def photograph_field(label: str, name: str) -> gr.Image:
-    """A field for one photograph, whose value is the path of the file that was dropped, unchanged."""
+def image_field(label: str, name: str) -> gr.Image:
+    """Build a field for one image; its value is the path of the unchanged file."""
     image = gr.Image(
         label=label,
         type="filepath",
         sources=["upload", "clipboard"],
-        height=PICTURE_HEIGHT,
+        height=IMAGE_HEIGHT,
         placeholder=DROP_HERE,
         elem_id=name,
     )
-    # gradio's own opens the file, and says what is wrong with it in words of Pillow.
+    # gradio's own preprocessing opens the file and reports Pillow's errors.
     vars(image)["preprocess"] = _path_of
     return image
 
 
-def _told(path: str | None, name: str) -> str:
-    """What a file that was dropped is, or what is wrong with it, as soon as it is there."""
+def _file_note(path: str | None, camera_input: str, camera: str, name: str) -> str:
+    """Return HTML with the size of a dropped image and what is missing in it, or its error."""
     if path is None:
         return ""
     try:
-        width, height = photograph_size(path, name)
+        width, height = image_size(path, name)
     except InputError as error:
-        return f'<div class="note bad" role="alert">{escape(look.for_visitors(str(error)))}</div>'
-    shows = "" if Path(path).suffix.lower() not in (".heic", ".heif") else "; browsers cannot show HEIC"
-    return f'<div class="note">{width} x {height} pixels{shows}</div>'
+        return templates.note(error_on_page(error, [Path(path).parent]))
+    shows = "" if Path(path).suffix.lower() not in (".heic", ".heif") else "; browsers cannot display HEIC"
+    size = f'<div class="note">{width} x {height} pixels{shows}</div>'
+    if camera_input == "images" and camera == "exif" and not states_focal_length(path):
+        missing = Message("The file does not state its focal length.", "Choose your camera below.")
+        size += templates.note(missing)
+    return size
+
+
+def _known_image(left: str | None, camera_input: str, scale_input: str) -> str:
+    """Return the left image on which the ends of the known length are tapped; empty if not needed."""
+    if left is None or camera_input != "images" or scale_input != "known":
+        return ""
+    try:
+        image_size(left, "the left image")
+        photo = in_8_bits(read_image(left)[0])
+    except InputError:
+        return ""  # reported below its field
+    shown = results.shrunk(photo)
+    size = photo.shape[1], photo.shape[0]
+    return templates.zoomable("ends", results.data_url(shown), "Left image: tap both ends", size)
 
 
 def _views() -> dict[str, Any]:
-    """The photographs and their cameras."""
+    """Build the fields of the images and cameras."""
     drawn: dict[str, Any] = {}
     with gr.Row():
-        for name, label in (("left", "Left photograph"), ("right", "Right photograph")):
+        notes = {}
+        for name, label in (("left", "Left image"), ("right", "Right image")):
             with gr.Column(min_width=130):
-                drawn[name] = photograph_field(label, name)
-                about = gr.HTML(elem_id=f"{name}-note")
-            told = partial(_told, name=f"the {label.lower()}")
-            drawn[name].change(told, drawn[name], about, **QUICK)
-    ways = [(label, name) for name, label in CAMERA_WAYS.items()]
-    drawn["way"] = way = gr.Radio(ways, value="file", label="What you know of the cameras", elem_id="way")
-    drawn["calib"] = calibration = gr.File(
+                drawn[name] = image_field(label, name)
+                notes[name] = gr.HTML(elem_id=f"{name}-note")
+    drawn["camera_input"] = gr.Radio(
+        [(label, name) for name, label in CAMERA_INPUTS.items()],
+        value="file",
+        label="Cameras",
+        elem_id="camera-input",
+    )
+    groups = _camera_fields(drawn)
+    for name, label in (("left", "the left image"), ("right", "the right image")):
+        inputs = [drawn[name], drawn["camera_input"], drawn["camera"]]
+        gr.on(
+            [field.change for field in inputs], partial(_file_note, name=label), inputs, notes[name], **LAST
+        )
+    sources = [drawn[name] for name in ("camera_input", "camera", "scale_input")]
+    groups_shown = partial(_visible, list(groups))
+    gr.on([field.change for field in sources], groups_shown, sources, list(groups.values()), **LAST)
+    return drawn
+
+
+def _camera_fields(drawn: dict[str, Any]) -> dict[str, Any]:
+    """Build the fields of all sources of the cameras; return the groups that appear and disappear."""
+    groups: dict[str, Any] = {}
+    drawn["calib"] = groups["calib"] = gr.File(
         label="Calibration file, or one per camera",
         file_count="multiple",
         height=CALIBRATION_HEIGHT,
         elem_id="calibration",
     )
-    readable = gr.HTML(look.formats(entry.summary for entry in CALIBRATION_FORMATS.values()))
-    with gr.Column(visible=False) as lens, gr.Row():
-        for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
+    groups["formats"] = gr.HTML(templates.formats(entry.summary for entry in CALIBRATION_FORMATS.values()))
+    groups["poselib"] = gr.HTML(templates.note(Message(NO_POSELIB)), visible=False)
+    with gr.Row(visible=False) as groups["camera"]:
+        drawn["camera"] = gr.Dropdown(
+            [*((label, name) for name, label in FOCAL_INPUTS.items()), *((name, name) for name in LENSES)],
+            value="exif",
+            label="Focal length",
+            elem_id="camera",
+        )
+        drawn["fov"] = groups["fov"] = _optional("fov", "such as 70", visible=False)
+    with gr.Column(visible=False) as groups["lens"], gr.Row():
+        for name, placeholder in (("fx", "required"), ("fy", "fx"), ("cx", "centre"), ("cy", "centre")):
             drawn[name] = _optional(name, placeholder)
-    note = "cx + doffs; empty means that of the left camera"
-    drawn["cx_right"] = cx_right = _optional("cx_right", "assumed as cx", info=note, visible=False)
-    drawn["baseline"] = _optional("baseline", "as the calibration file says")
-
-    with gr.Row(visible=False) as length:
-        drawn |= _length_fields(drawn["left"])
-
-    def show(chosen: str) -> list[Any]:
-        by_file = chosen == "file"
-        shown = by_file, by_file, not by_file, chosen == "numbers", chosen == "photographs"
-        return [gr.update(visible=seen) for seen in shown]
-
-    way.change(show, way, [calibration, readable, lens, cx_right, length], **QUICK)
-    return drawn
-
-
-def _length_fields(left: gr.Image) -> dict[str, Any]:
-    """A known length, and its ends, which are typed or tapped on the left photograph."""
-    known_length = _optional("known_length", "such as a door's height")
-    ends = gr.Textbox(
-        label="Its two ends, px", placeholder="tap them, best in full screen", max_lines=1, elem_id="ends"
+    note = "cx + doffs (default: the left camera's cx)"
+    drawn["cx_right"] = groups["cx_right"] = _optional("cx_right", "same as cx", info=note, visible=False)
+    drawn["scale_input"] = groups["scale"] = gr.Radio(
+        [(label, name) for name, label in SCALE_INPUTS.items()],
+        value="measured",
+        label="Scale",
+        elem_id="scale-input",
+        visible=False,
     )
+    with gr.Row():
+        drawn["baseline"] = groups["baseline"] = _optional("baseline", BASELINE_PLACEHOLDERS["file"])
+        drawn["baseline_error"] = groups["error"] = _optional("baseline_error", "unknown", visible=False)
+    drawn["guess"] = groups["guess"] = gr.Dropdown(
+        list(GUESSES),
+        value=next(iter(GUESSES)),
+        label="Distance between the positions",
+        visible=False,
+        elem_id="guess",
+    )
+    with gr.Column(visible=False) as groups["length"]:
+        _length_fields(drawn)
+    return groups
 
-    def tap(before: list[int], event: gr.SelectData) -> tuple[list[int], str]:
-        """The pixels of both ends; a third tap begins anew."""
-        pixels = [*before, *event.index] if len(before) == 2 else list(event.index)
-        return pixels, ", ".join(map(str, pixels))
 
-    tapped = gr.State([])  # at the server, where a second tap knows of the first
-    left.select(tap, tapped, [tapped, ends], **TAPS)
-    left.change(lambda: ([], ""), outputs=[tapped, ends], **QUICK)
-    return {"known_length": known_length, "ends": ends}
+def _visible(groups: list[str], camera_input: str, camera: str, scale_input: str) -> list[Any]:
+    """Return which groups of fields appear, and the distance's placeholder."""
+    by_images = camera_input == "images"
+    shown = {
+        "calib": camera_input == "file",
+        "formats": camera_input == "file",
+        "poselib": by_images and not can_estimate(),
+        "camera": by_images,
+        "fov": by_images and camera == "fov",
+        "lens": camera_input == "numbers" or (by_images and camera == "fx"),
+        "cx_right": camera_input == "numbers",
+        "scale": by_images,
+        "baseline": not by_images or scale_input == "measured",
+        "error": by_images and scale_input == "measured",
+        "guess": by_images and scale_input == "guess",
+        "length": by_images and scale_input == "known",
+    }
+    placeholder = {"placeholder": BASELINE_PLACEHOLDERS[camera_input]}
+    more = {"baseline": placeholder}
+    return [gr.update(visible=shown[name], **more.get(name, {})) for name in groups]
+
+
+def _length_fields(drawn: dict[str, Any]) -> None:
+    """Build the fields of a known length and its ends, which are typed or tapped on the left image."""
+    drawn["known_length"] = _optional("known_length", "such as 2 m, the height of a door")
+    image = gr.HTML(elem_id="known-image")
+    drawn["ends"] = gr.Textbox(
+        label="Its two ends, px", placeholder="tap them above", max_lines=1, elem_id="ends"
+    )
+    inputs = [drawn[name] for name in ("left", "camera_input", "scale_input")]
+    gr.on([field.change for field in inputs], _known_image, inputs, image, **LAST)
+    drawn["left"].change(lambda: "", outputs=drawn["ends"], **QUICK)
 
 
 def _settings(priors: Priors) -> dict[str, Any]:
     drawn: dict[str, Any] = {}
+    options = settings_of(RunOptions)
     with gr.Accordion("Settings", open=False):
         with gr.Row():
             drawn["prior"] = gr.Dropdown(list(priors.names), value=priors.names[0], label="Prior")
             drawn["preset"] = gr.Dropdown(
-                list(PRESETS), value="default", label="Preset", info=help_of("preset")
+                list(options["preset"].choices),
+                value=options["preset"].default,
+                label="Preset",
+                info=options["preset"].help,
             )
         with gr.Row():
-            for name, label, least in (("steps", "Steps", 0), ("ensemble", "Ensemble", 1)):
+            for name, label, low in (("steps", "Steps", 0), ("ensemble", "Ensemble", 1)):
                 drawn[name] = gr.Slider(
-                    least, LIMITS[name], value=least, step=1, label=label, info=help_of(name)
+                    low, LIMITS[name], value=low, step=1, label=label, info=options[name].help
                 )
         with gr.Row():
             drawn["resolution"] = gr.Slider(
-                0, 1536, value=0, step=32, label="Resolution, px", info="0: the prior's own"
+                0, 1536, value=0, step=32, label="Resolution, px", info="0: the prior's default"
             )
             drawn["seed"] = gr.Number(0, precision=0, minimum=0, label="Seed", min_width=90)
         with gr.Row():
@@ -222,11 +318,11 @@ def _settings(priors: Priors) -> dict[str, Any]:
 
 
 def build_examples() -> gr.Gallery:
-    """Draw the examples into the open gradio context."""
-    gr.HTML(f'<div class="legend-caption" id="examples-note">{look.EXAMPLES_NOTE}</div>')
+    """Build the gallery of examples in the open gradio context."""
+    gr.HTML(f'<div class="legend-caption" id="examples-note">{templates.EXAMPLES_NOTE}</div>')
     return gr.Gallery(
         [(str(example.left), example.label) for example in EXAMPLES],
-        label="Examples: one click runs one",
+        label="Examples: click one to run it",
         show_label=False,
         columns=len(EXAMPLES),
         rows=1,
@@ -239,10 +335,10 @@ def build_examples() -> gr.Gallery:
 
 
 def build_form(priors: Priors) -> Form:
-    """Draw the fields into the open gradio context."""
+    """Build the form in the open gradio context."""
     drawn = _views() | _settings(priors)
-    untouched = {name: component.value for name, component in drawn.items()}
+    initial = {name: component.value for name, component in drawn.items()}
     with gr.Row(elem_id="actions"):
         run = gr.Button("Estimate depth", variant="primary", scale=3, min_width=120, elem_id="run")
-        stop = gr.Button("Stop", scale=1, min_width=70, elem_id="stop")
-    return Form(drawn, untouched, run, stop)
+        stop = gr.Button("Stop", scale=1, min_width=70, interactive=False, elem_id="stop")
+    return Form(drawn, initial, run, stop)

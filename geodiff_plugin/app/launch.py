@@ -1,4 +1,4 @@
-"""``geodiff app``: serves the page, without any request to another host."""
+"""Implements ``geodiff app``: serves the page without requests to other hosts."""
 
 from __future__ import annotations
 
@@ -10,19 +10,26 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from urllib.parse import urlsplit
 
-from geodiff_plugin._checks import bad_value, refuse
+from geodiff_plugin._internal.checks import bad_value, raise_input_error
 
-#: What the page may load and talk to: itself. A browser that is offline misses nothing.
+try:
+    import fcntl
+except ImportError:  # Windows: folders of killed servers stay
+    fcntl = None  # type: ignore[assignment]
+
+#: Content security policy: the page loads from and connects to its own server only, so it works offline.
 POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob:; "
     "worker-src 'self' blob:"
 )
-#: Sites that may show the page in a frame: a Space is one in Hugging Face's page.
+#: Sites that may embed the page in a frame. Hugging Face embeds its Spaces.
 FRAMES = "'self' https://huggingface.co https://*.hf.space" if "SPACE_ID" in os.environ else "'self'"
 HEADERS = (
     (b"content-security-policy", f"{POLICY}; frame-ancestors {FRAMES}".encode()),
@@ -30,39 +37,45 @@ HEADERS = (
     (b"referrer-policy", b"same-origin"),
 )
 QUIET = {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_DISABLE_TELEMETRY": "1"}
-SESSIONS_KEPT = 200
-#: Requests that wait, clicks among them; runs have a shorter queue of their own.
+MAX_SESSIONS = 200
+#: Maximum number of queued requests, including clicks. Runs have their own, shorter queue.
 QUEUE = 60
-LARGEST_FILE = "40mb"
+MAX_FILE_SIZE = "40mb"
+#: Prefix of a server's folder of uploads and results.
+FOLDER_PREFIX = "geodiff-app-"
+#: Name of the file in it that the server keeps locked.
+LOCK = "lock"
+#: Packages of the extra ``app`` that single functions of the page need, with these functions.
+NEEDED_BY = {"poselib": "estimating the cameras", "pillow_heif": "HEIC images"}
 
 
 @dataclass(frozen=True)
 class _Guard:
-    """ASGI middleware: adds ``HEADERS`` to every answer, and refuses what another site's page asks for."""
+    """ASGI middleware: adds ``HEADERS`` to every response, and rejects cross-site requests."""
 
     app: Any
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        async def say(message: Any) -> None:
+        async def respond(message: Any) -> None:
             if message["type"] == "http.response.start":
                 message["headers"] = [*message.get("headers", []), *HEADERS]
             await send(message)
 
         if scope["type"] != "http":
             await self.app(scope, receive, send)
-        elif refused := _refused(dict(scope["headers"]), scope.get("server")):
-            await say({"type": "http.response.start", "status": 403, "headers": []})
-            await say({"type": "http.response.body", "body": refused.encode()})
+        elif reason := _rejection(dict(scope["headers"]), scope.get("server")):
+            await respond({"type": "http.response.start", "status": 403, "headers": []})
+            await respond({"type": "http.response.body", "body": reason.encode()})
         else:
-            await self.app(scope, receive, say)
+            await self.app(scope, receive, respond)
 
 
-def _refused(headers: dict[bytes, bytes], server: tuple[str, int | None] | None) -> str:
-    """Why a request is refused; empty where it is not."""
+def _rejection(headers: dict[bytes, bytes], server: tuple[str, int | None] | None) -> str:
+    """Return why a request is rejected; empty if it is accepted."""
     if _is_foreign(headers):
-        return "Requests of other sites are refused."
+        return "Cross-site requests are rejected."
     if server is not None and _is_loopback(server[0]) and not _names_loopback(headers):
-        return "This server is reached as localhost only."
+        return "This server accepts requests to localhost only."
     return ""
 
 
@@ -79,58 +92,99 @@ def _is_loopback(host: str) -> bool:
 
 
 def _names_loopback(headers: dict[bytes, bytes]) -> bool:
-    """Whether the browser asked this machine by one of its own names, not by one that was bound to it."""
+    """Whether the Host header names this machine's loopback, and not a domain that resolves to it."""
     host = urlsplit(f"//{headers.get(b'host', b'').decode('latin-1')}").hostname
     return host is not None and _is_loopback(host)
 
 
-def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **options: Any) -> Any:
-    """Build the page and launch it; further ``options`` are those of ``gradio.Blocks.launch``.
+def _is_locked(file: IO[bytes]) -> bool:
+    """Lock an open file until it is closed; return whether another process has locked it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # locked, or a file system without locks
+        return True
+    return False
 
-    A visitor may choose among ``priors``, named as ``load_prior`` takes them; the first is the default.
+
+def _remove_leftovers() -> None:
+    """Delete the folders of killed servers, which are those whose lock nobody holds."""
+    for lock in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/{LOCK}") if fcntl else ():
+        with suppress(OSError), lock.open("rb") as file:  # of another user, or already deleted
+            if not _is_locked(file):
+                shutil.rmtree(lock.parent, ignore_errors=True)
+
+
+def _new_folder() -> str:
+    """Create and lock the folder of uploads and results, which is deleted at exit."""
+    folder = tempfile.mkdtemp(prefix=FOLDER_PREFIX)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    lock = open(Path(folder, LOCK), "wb")  # noqa: SIM115 - locked until the process ends
+    if fcntl:
+        _is_locked(lock)
+    atexit.register(lock.close)
+    return folder
+
+
+def launch_page(
+    priors: tuple[str, ...] = ("bundled",), device: str = "auto", dtype: str = "float32", **options: Any
+) -> Any:
+    """Build and launch the page; passes further ``options`` to ``gradio.Blocks.launch``.
+
+    Visitors choose among ``priors``, names accepted by ``load_prior``; the first is the default. ``dtype`` is
+    the precision of their weights.
     """
     if importlib.util.find_spec("gradio") is None:
-        cure = "Install it with: pip install 'geodiff-plugin[app]'."
-        refuse(f"geodiff app needs gradio, which is not installed. {cure}")
-    os.environ.update(QUIET)  # gradio looks at it when it is imported
-    folder = tempfile.mkdtemp(prefix="geodiff-app-")  # of uploads and results, which goes with this process
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    os.environ["GRADIO_TEMP_DIR"] = tempfile.tempdir = folder
+        hint = "Install it with: pip install 'geodiff-plugin[app]'."
+        raise_input_error(f"geodiff app needs gradio, which is not installed. {hint}")
+    os.environ.update(QUIET)  # gradio reads these when it is imported
+    _remove_leftovers()
+    os.environ["GRADIO_TEMP_DIR"] = tempfile.tempdir = _new_folder()
     from starlette.middleware import Middleware
 
-    from geodiff_plugin.app.form import EXAMPLES
-    from geodiff_plugin.app.job import Priors, results_folder
-    from geodiff_plugin.app.look import CSS
+    from geodiff_plugin.app.job import EXAMPLES, Priors, results_folder
     from geodiff_plugin.app.page import THEME, build_page
+    from geodiff_plugin.app.templates import CSS
     from geodiff_plugin.runtime.machine import pick_device
 
-    offered = Priors(priors, pick_device(device))
-    offered.get(priors[0])  # a name that cannot be loaded is told here, not to the first visitor
+    offered = Priors(priors, pick_device(device), dtype)
+    offered.get(priors[0])  # fails here, not for the first visitor, if it cannot be loaded
     page = build_page(offered)
     viewer = Path(__file__).with_name("viewer.js").read_text(encoding="utf-8")
     results_folder().mkdir()
-    handed_out = [results_folder(), *(example.folder for example in EXAMPLES)]
+    served = [results_folder(), *(example.folder for example in EXAMPLES)]
     return page.queue(max_size=QUEUE, default_concurrency_limit=8).launch(
         theme=THEME,
         css=CSS,
         head=f"<script>{viewer}</script>",
-        allowed_paths=[str(path) for path in handed_out],
-        state_session_capacity=SESSIONS_KEPT,
-        max_file_size=LARGEST_FILE,
+        allowed_paths=[str(path) for path in served],
+        state_session_capacity=MAX_SESSIONS,
+        max_file_size=MAX_FILE_SIZE,
         footer_links=[],
         app_kwargs={"middleware": [Middleware(_Guard)]},
+        quiet=True,
         **options,
     )
 
 
-def run_app(prior: tuple[str, ...], device: str, host: str, port: int | None, browser: bool) -> None:
-    """Serve until Ctrl-C, or until the process is asked to end."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that what visitors gave is deleted
+def run_app(
+    prior: tuple[str, ...], device: str, dtype: str, host: str, port: int | None, browser: bool
+) -> None:
+    """Serve until Ctrl-C or SIGTERM."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that uploads are deleted
+    for package, purpose in NEEDED_BY.items():
+        if importlib.util.find_spec(package) is None:
+            hint = "pip install 'geodiff-plugin[app]'"
+            print(f"Without {package}, {purpose} is unavailable. Install it with: {hint}", file=sys.stderr)
     where = {"server_name": host, "server_port": port, "inbrowser": browser, "share": False}
     try:
-        launch_page(prior, device, **where)
+        _, address, _ = launch_page(prior, device, dtype, **where, prevent_thread_lock=True)
+        print(f"Serving on {address} (Ctrl-C stops the server)", flush=True)
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
     except OSError as error:
         if "empty port" not in str(error):
             raise
-        got = f"{host} and {port or 'no free port'}, taken by another program or not of this machine"
-        bad_value("--host and --port", "free to listen on", got, "Name another port, or leave out --port.")
+        got = f"{host} and {port or 'no free port'}, which is in use or not an address of this machine"
+        bad_value(
+            "--host and --port", "an address with a free port", got, "Choose another port, or omit --port."
+        )

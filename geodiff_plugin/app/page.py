@@ -1,29 +1,48 @@
-"""The page: its panels, and what happens on every click."""
+"""The page: its panels and event handlers."""
 
 from __future__ import annotations
 
 import filecmp
+import math
 import re
 import sys
 import tempfile
-import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import gradio as gr
 
-from geodiff_plugin._checks import InputError, UnknownFormatError
-from geodiff_plugin.app import look, results
-from geodiff_plugin.app.form import EXAMPLES, QUICK, TAPS, Form, build_examples, build_form
-from geodiff_plugin.app.job import Priors, run_job
-from geodiff_plugin.app.keeping import FORGET_AFTER_S, Keeper, Session, Sessions, Stopped, Turns, forget
-from geodiff_plugin.app.shown import Pixels, Shown, load, shown_of
+from geodiff_plugin._internal.checks import InputError, UnknownFormatError
+from geodiff_plugin.app import results, templates
+from geodiff_plugin.app.form import QUICK, TAPS, Form, build_examples, build_form
+from geodiff_plugin.app.job import EXAMPLES, Priors, Request, run_job, write_job
+from geodiff_plugin.app.messages import Message, PageError, error_on_page
+from geodiff_plugin.app.results import Measurement
+from geodiff_plugin.app.sessions import (
+    FORGET_AFTER_S,
+    Result,
+    ResultStore,
+    Run,
+    RunQueue,
+    Session,
+    Sessions,
+    Stopped,
+)
+from geodiff_plugin.app.shown import Shown, clean_report, load, shown_of
+from geodiff_plugin.jobs import PairRun
 
 FILES_TAB = "Files"
-#: The result that the page opens with; ``python -m tests.browser.make_first_result`` makes it anew.
+#: Panels of each tab. The open tab is drawn first.
+PANELS_OF_TABS = {
+    "3D": ("scene_data", "marks_data", "headline"),
+    "Depth": ("scene_data", "marks_data", "depth", "legend"),
+    "Measure": ("scene_data", "marks_data", "readings"),
+    "Confidence": ("confidence",),
+}
+#: The result that the page opens with. Regenerate it with ``python -m tests.browser.make_first_result``.
 FIRST_RESULT = Path(__file__).with_name("first.npz")
 THEME = gr.themes.Base(
     primary_hue="teal",
@@ -49,7 +68,7 @@ THEME = gr.themes.Base(
 
 @dataclass(frozen=True)
 class Panels:
-    """The components that show a result; each takes HTML, but the last ones."""
+    """The components that show a result; all take HTML except the last ones."""
 
     status: gr.HTML
     scene_data: gr.HTML
@@ -57,274 +76,392 @@ class Panels:
     headline: gr.HTML
     depth: gr.HTML
     legend: gr.HTML
-    picture: gr.HTML
     readings: gr.HTML
     confidence: gr.HTML
     files: gr.HTML
     tabs: gr.Tabs
-    pick: gr.Button  # that the browser's script presses for a click on a picture
+    pick: gr.Button  # pressed by the browser's script on a click on an image
     picked: gr.Textbox  # the pixel of that click
     pixel: gr.Textbox
     add: gr.Button
-    clear: gr.Button
-    paths: gr.File  # what ``files`` links to, for programs that ask over the API
+    undo: tuple[gr.Button, ...]
+    clear: tuple[gr.Button, ...]
+    paths: gr.File  # targets of the links in ``files``, for API clients
 
     def of_result(self) -> list[gr.HTML]:
-        """Those whose value is made of a result."""
+        """Return the components that are computed from a result."""
         return [each for f in fields(self) if isinstance(each := getattr(self, f.name), gr.HTML)]
 
 
-@dataclass(frozen=True)
-class Memory:
-    """What is known of one open tab between its clicks."""
-
-    secret: gr.Textbox  # of the result that is shown, or empty; hidden in the browser
-    pixels: gr.State  # that were chosen in it
-
-
-@dataclass(frozen=True)
-class First:
-    """The result that was made beforehand, and the pixels that were measured in it."""
-
-    shown: Shown
-    pixels: Pixels
-
-
-def read_first_result() -> First:
-    """The result that the page opens with."""
-    example = EXAMPLES[0]
-    return First(*load(FIRST_RESULT, example.left, f"example {example.label}, computed beforehand"))
+def read_first_result() -> Result:
+    """Load the precomputed result on display when the page opens."""
+    return Result(*load(FIRST_RESULT, EXAMPLES[0].left, EXAMPLES[0].label))
 
 
 def _uploads(paths: list[str | None]) -> set[Path]:
-    """The folders of a visitor's uploads; gradio names them by content, so examples are everybody's."""
+    """Return the folders of a visitor's uploads, without copies of examples.
+
+    gradio names folders by content, so all visitors share the copies of the examples.
+    """
     temporary = Path(tempfile.gettempdir()).resolve()
     examples = [path for example in EXAMPLES for path in example.folder.iterdir()]
     given = [Path(path) for path in paths if path and temporary in Path(path).resolve().parents]
-    there = [path for path in given if path.is_file()]
-    return {p.parent for p in there if not any(filecmp.cmp(p, each, shallow=False) for each in examples)}
+    existing = [path for path in given if path.is_file()]
+    return {p.parent for p in existing if not any(filecmp.cmp(p, each, shallow=False) for each in examples)}
 
 
-def _failed(error: Exception) -> str:
-    """HTML of a sentence for the visitor; a defect's traceback goes to the terminal."""
-    if isinstance(error, UnknownFormatError):
-        return look.failed(look.UNKNOWN_CALIBRATION, look.LINK_TO_FORMATS)
+def _failed(error: Exception, request: Request | None = None) -> str:
+    """Return the HTML of an error; print the traceback of an internal error to the terminal."""
     if isinstance(error, InputError):
-        return look.failed(look.for_visitors(str(error)))
+        options = None if request is None else request.options
+        paths = () if options is None else (*options.image_files().values(), *options.calib)
+        message = error_on_page(error, {path.parent for path in paths})
+        link = templates.LINK_TO_FORMATS if isinstance(error, UnknownFormatError) else ""
+        return templates.failed(message, link)
     traceback.print_exception(error, file=sys.stderr)
-    return look.failed(f"This is a defect, not your input: {type(error).__name__}.")
+    return templates.failed(
+        Message(f"Internal error ({type(error).__name__}).", "Your input is not the cause. Run again.")
+    )
 
 
-def _measured(shown: Shown, pixels: Pixels) -> dict[str, str]:
-    """HTML of the panels that change with every point."""
-    found = results.measurement(shown, pixels)
+def _measured(result: Result) -> dict[str, str]:
+    """Return the HTML of the panels that change with every measured point."""
+    found = Measurement.of(result)
     return {
-        "marks_data": look.hidden(results.marks_data(found.readings)),
-        "headline": found.headline,
-        "picture": look.picture(results.data_url(found.picture), "Photograph with the measured points"),
-        "readings": found.words,
+        "marks_data": templates.hidden(found.marks()),
+        "headline": found.headline(),
+        "readings": found.html(),
     }
 
 
-def _drawn(shown: Shown, pixels: Pixels, paths: Sequence[Path] = ()) -> dict[str, str]:
-    """HTML of every panel for a result, with its files."""
-    photograph, depth = (results.picture(shown, name) for name in ("photograph", "depth"))
-    assert photograph is not None and depth is not None
-    sure = results.picture(shown, "confidence")
-    confidence = "This preset gives no confidence."
-    if sure is not None:
-        confidence = look.picture(results.data_url(sure), "Map of confidence")
-        confidence += results.legend_of_confidence()
-    return {
-        "status": look.banner(shown),
-        "scene_data": look.hidden(results.scene_data(shown)),
-        "depth": look.compared(results.data_url(photograph), results.data_url(depth)),
-        "legend": results.legend_of_depth(shown.depth_m),
-        "confidence": confidence,
-        "files": look.files(paths),
-        **_measured(shown, pixels),
-    }
+def _depth(result: Result) -> dict[str, str]:
+    """Return the HTML of the depth map and its legend."""
+    depth = results.map_image(result.shown, "depth")
+    assert depth is not None
+    legend = results.legend_of_depth(result.shown.depth_m)
+    return {"depth": templates.compared(results.data_url(depth)), "legend": legend}
+
+
+def _confidence(result: Result) -> dict[str, str]:
+    """Return the HTML of the confidence map."""
+    confidence = results.map_image(result.shown, "confidence")
+    if confidence is None:
+        return {"confidence": "This preset estimates no confidence."}
+    image = templates.image(results.data_url(confidence), "Confidence map")
+    return {"confidence": image + results.legend_of_confidence()}
+
+
+def _scene(result: Result) -> dict[str, str]:
+    """Return the data of the 3D view."""
+    return {"scene_data": templates.hidden(results.scene_data(result.shown))}
+
+
+def _files(result: Result) -> dict[str, str]:
+    """Return the HTML of the list of files."""
+    if result.shown.folder is None and not result.shown.precomputed:
+        return {"files": templates.FILES_COMING}
+    return {"files": templates.files(results.files_of(result), results.PURPOSES)}
+
+
+def drawn(result: Result, tab: str = "") -> Iterator[dict[str, str]]:
+    """Yield the HTML of all panels of a result: the banner and the open tab first, then the others."""
+    parts = {"scene_data": _scene, "headline": _measured, "depth": _depth, "confidence": _confidence}
+    wanted = PANELS_OF_TABS.get(tab, PANELS_OF_TABS["3D"])
+    first = [part for name, part in parts.items() if name in wanted or part is _measured]
+    now: dict[str, str] = {"status": templates.banner(result.shown)}
+    for part in first:
+        now |= part(result)
+    yield now
+    rest: dict[str, str] = {}
+    for part in (*(part for part in parts.values() if part not in first), _files):
+        rest |= part(result)
+    yield rest
 
 
 def _nothing(status: str) -> dict[str, str]:
-    """HTML of the panels without a result, and why there is none."""
-    empty = dict.fromkeys(("scene_data", "marks_data", "depth", "legend", "picture", "confidence"), "")
-    empty |= {"headline": look.headline("", "No result yet."), "files": look.WAITING}
-    return empty | {"readings": look.HOW_TO_MEASURE, "status": status}
+    """Return the HTML of the panels without a result; ``status`` states the reason."""
+    empty = dict.fromkeys(("scene_data", "marks_data", "depth", "legend", "confidence"), "")
+    empty |= {"headline": templates.headline("", "No result yet."), "files": templates.WAITING}
+    return empty | {"readings": templates.HOW_TO_MEASURE, "status": status}
 
 
 @dataclass(frozen=True)
-class _Desk:
-    """What runs and measurements need beside their fields; one for all visitors."""
+class _Handlers:
+    """State shared by the event handlers of all visitors.
 
-    first: First
+    A visitor's pair, result and measurements are one ``Result`` in the visitor's session. Each handler reads
+    and changes it there, and returns what the page shows of it.
+    """
+
     form: Form
     panels: Panels
-    memory: Memory
+    secret: gr.Textbox  # secret of the result on display, or empty; hidden in the browser
     priors: Priors
     sessions: Sessions
-    turns: Turns
+    queue: RunQueue
+    progress: gr.HTML  # box of a run, below gradio's progress
 
     def on_panels(self, html: dict[str, str]) -> dict[Any, Any]:
-        """Values of components by the names of panels."""
+        """Return a value per component from a value per panel name."""
         return {getattr(self.panels, name): value for name, value in html.items()}
 
     def of_result(self) -> list[Any]:
-        """What a new result changes, in the order in which programs get it."""
-        return [*self.panels.of_result(), self.panels.paths, self.memory.secret, self.memory.pixels]
+        """Return the components that a new result changes, in the order of the API."""
+        return [*self.panels.of_result(), self.panels.paths, self.secret]
 
-    def show(self, secret: str, shown: Shown) -> dict[Any, Any]:
-        """Everything on a new result."""
-        paths = results.files_of(shown)
-        html = self.on_panels(_drawn(shown, [], paths))
-        return {
-            self.panels.paths: [str(path) for path in paths],
-            self.memory.secret: secret,
-            self.memory.pixels: [],
-            **html,
-        }
+    def keep(self, session: Session, notice: str) -> dict[Any, Any]:
+        """Return a notice above the result that stays on display, or no result if it has expired."""
+        result = self.sessions.result(session)
+        if result is not None:
+            return {self.panels.status: templates.earlier(notice, result.shown)}
+        return {self.panels.paths: None, **self.on_panels(_nothing(notice))}
 
-    def show_nothing(self, status: str) -> dict[Any, Any]:
-        """Nothing, and why."""
-        html = self.on_panels(_nothing(status))
-        return {self.panels.paths: None, self.memory.secret: "", self.memory.pixels: [], **html}
+    def compute(self, session: Session, run: Run, request: Request, progress: Any) -> PairRun:
+        """Run a job, and make its result the one of the session."""
+        job = run_job(request, self.priors, run.stop, progress)
+        shown = shown_of(job, request.name, request.scale_rel_std)
+        self.sessions.show(session, run, shown, _measurable(shown, request))
+        return job
 
-    def run(self, session: Session, filled: tuple[Any, ...], progress: Any) -> Shown:
-        """The result of the fields as a visitor filled them in."""
-        wanted, stop = self.form.options(filled), session.stop
+    def write(self, secret: str, job: PairRun) -> dict[Any, Any]:
+        """Write the files of a result; return the values of their components."""
+        folder = clean_report(write_job(job))
+        result = self.sessions.store.get(secret) if self.sessions.store.add_files(secret, folder) else None
+        if result is None:
+            return {}
+        paths = results.files_of(result)
+        return {self.panels.paths: [str(path) for path in paths], **self.on_panels(_files(result))}
+
+    def steps(self, session: Session, run: Run, request: Request, progress: Any) -> Iterator[dict[Any, Any]]:
+        """Yield what the page shows of a run: its result as soon as it exists, then the files."""
 
         def wait(others: int) -> None:
             runs = "1 run is" if others == 1 else f"{others} runs are"
-            progress(0.0, f"Waiting: {runs} before yours")
+            progress(0.0, f"Queued: {runs} ahead of yours")
 
-        with self.turns.turn(session, wait):
-            shown = shown_of(run_job(wanted, self.priors, stop, progress))
-        if stop.is_set():  # the visitor stopped it, or left, during its last stage
-            forget(shown)
-            raise Stopped
-        return shown
+        with self.queue.acquire(run, wait):
+            job = self.compute(session, run, request, progress)
+            secret, result = session.secret, self.sessions.result(session)
+            if result is None:
+                return
+            for html in drawn(result, session.tab):
+                yield {self.secret: secret, **self.on_panels(html), **self.controls("")}
+            yield self.write(secret, job)
+
+    def run(
+        self, session: Session, filled: tuple[Any, ...], progress: Any, values: dict[Any, Any]
+    ) -> Iterator[dict[Any, Any]]:
+        """Yield what the page shows while a run is in progress, and how it ended; first also ``values``.
+
+        A later run of the same visitor ends this one without a message.
+        """
+        run, request = session.begin(), None
+        yield values | self.keep(session, "") | self.controls(templates.running(self.form.name(filled)))
+        try:
+            request = self.form.request(filled)
+            for shown in self.steps(session, run, request, progress):
+                if shown and session.run is run:
+                    yield shown
+            ended: dict[Any, Any] = {}
+        except Stopped:
+            ended = self.keep(session, templates.STOPPED)
+        except Exception as error:  # the visitor always gets a message
+            ended = self.keep(session, _failed(error, request))
+        if session.end(run):
+            yield ended | self.controls("")
+        yield {self.panels.paths: gr.skip()}  # gradio repeats the last update when a run ends
+
+    def controls(self, running: str) -> dict[Any, Any]:
+        """Return the box of a run, empty if there is none, and the stop button, which is active in a run."""
+        return {self.progress: running, self.form.stop: gr.update(interactive=bool(running))}
 
     def estimate(
         self,
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
         *values: Any,
+    ) -> Iterator[dict[Any, Any]]:
+        """Estimate metric depth of the left image and write its files."""
+        yield from self.run(self.sessions.of(request.session_hash), values, progress, {})
+
+    def estimate_at_once(
+        self,
+        request: gr.Request,
+        progress: gr.Progress = gr.Progress(),  # noqa: B008
+        *values: Any,
     ) -> dict[Any, Any]:
-        """Depth in metres of the left photograph, with its files."""
-        session, keeper = self.sessions.of(request.session_hash), self.sessions.keeper
-        try:
-            shown = self.run(session, values, progress)
-            keeper.drop(session.secret)
-            session.secret = keeper.add(shown)
-            return self.show(session.secret, shown)
-        except Stopped:
-            return self.show_nothing(look.STOPPED)
-        except Exception as error:  # whatever it is, the visitor reads a sentence
-            return self.show_nothing(_failed(error))
-        finally:
-            session.stop = threading.Event()
+        """Estimate metric depth of the left image and write its files, for API clients."""
+        shown: dict[Any, Any] = {}
+        for update in self.run(self.sessions.of(request.session_hash), values, progress, {}):
+            shown |= {component: value for component, value in update.items() if value != gr.skip()}
+        outputs = self.of_result()
+        return {component: shown[component] for component in outputs if component in shown}
 
-    def come(self, request: gr.Request) -> str:
-        """What is said at once when a run was asked for."""
-        self.sessions.of(request.session_hash)
-        return look.BUSY
+    def run_example(
+        self,
+        request: gr.Request,
+        event: gr.SelectData,
+        progress: gr.Progress = gr.Progress(),  # noqa: B008
+    ) -> Iterator[dict[Any, Any]]:
+        """Fill in an example and run it."""
+        values = self.form.example(int(event.index))
+        filled = dict(zip(self.form.fields.values(), values, strict=True))
+        yield from self.run(self.sessions.of(request.session_hash), tuple(values), progress, filled)
 
-    def stop(self, request: gr.Request) -> str:
-        """End the visitor's run before its next step."""
-        self.sessions.of(request.session_hash).stop.set()
-        return look.STOPPED
+    def stop(self, request: gr.Request) -> None:
+        """Stop the visitor's run before its next step."""
+        self.sessions.of(request.session_hash).stop()
 
     def note_uploads(self, request: gr.Request, left: Any, right: Any, files: Any) -> None:
-        """Remember a visitor's uploads, to delete them when the visitor leaves."""
+        """Record a visitor's uploads, to delete them when the tab is closed."""
         paths = [left, right, *(files or ())]
         self.sessions.of(request.session_hash).uploads |= _uploads(paths)
 
-    def come_back(self, request: gr.Request, secret: str) -> dict[Any, Any]:
-        """The result that a tab had before it was reloaded, if it is still there."""
-        shown = self.sessions.keeper.get(secret)
-        if shown is None:
-            return {self.memory.secret: ""}
-        self.sessions.keeper.end_in(secret, FORGET_AFTER_S)
+    def restore(self, request: gr.Request, secret: str, by_phone: bool) -> dict[Any, Any]:
+        """Return the result that a tab had before a reload, if it has not expired.
+
+        A phone's visitors have no calibration, so its form begins with the images alone.
+        """
+        preset = {self.form.fields["camera_input"]: "images"} if by_phone else {}
+        result = self.sessions.store.get(secret)
+        if result is None:
+            return {self.secret: "", **preset}
+        self.sessions.store.end_in(secret, FORGET_AFTER_S)
         self.sessions.of(request.session_hash).secret = secret
-        return self.show(secret, shown)
+        shown = {self.secret: secret, self.panels.paths: [str(path) for path in results.files_of(result)]}
+        for html in drawn(result):
+            shown |= self.on_panels(html)
+        return shown | preset
 
-    def shown_by(self, secret: str) -> Shown | None:
-        """The result of a tab, at first the one that was made beforehand; ``None`` when its time is over."""
-        return self.sessions.keeper.get(secret) if secret else self.first.shown
+    def measure(self, request: gr.Request, secret: str, change: Any) -> dict[Any, Any]:
+        """Change the pixels of the result on display by ``change``, and update what shows them.
 
-    def measure(self, secret: str, pixels: Pixels) -> dict[Any, Any]:
-        """What the maps say at these pixels, on every panel that says it."""
-        shown = self.shown_by(secret)
-        if shown is None:
-            return {self.panels.readings: look.failed("This result is no longer here. Estimate again.")}
-        return {self.memory.pixels: pixels, **self.on_panels(_measured(shown, pixels))}
-
-    def add_point(self, secret: str, pixels: Pixels, typed: str) -> dict[Any, Any]:
-        """One more point, by its pixel as it was typed or clicked."""
-        numbers = [int(word) for word in re.findall(r"\d{1,13}", typed or "")]
-        if len(numbers) < 2:
-            return {self.panels.readings: "Type two whole numbers: x, y."}
+        ``secret`` belongs to the result that the visitor saw. Nothing happens if another one replaced it.
+        """
+        session = self.sessions.of(request.session_hash)
+        if not session.secret and session.run is None:
+            session.secret = secret  # the connection was lost and the session forgotten
+        result = self.sessions.store.get(secret) if secret else session.first
+        if result is None:
+            return {self.panels.readings: templates.failed(Message(templates.EXPIRED))}
+        if secret != session.secret:
+            return {self.panels.readings: gr.skip()}
         try:
-            return self.measure(secret, [*pixels, (numbers[0], numbers[1])][-len(results.NAMES) :])
-        except InputError as error:
-            return {self.panels.readings: _failed(error)}
+            result.pixels[:] = change(result)
+        except PageError as error:
+            html = Measurement.of(result).html()
+            message = templates.note(error_on_page(error))
+            hint = templates.headline("", str(error))
+            return self.on_panels({"readings": message + html, "headline": hint})
+        return self.on_panels(_measured(result))
 
-    def clear_points(self, secret: str) -> dict[Any, Any]:
-        """No points."""
-        return self.measure(secret, [])
+    def add_point(self, request: gr.Request, secret: str, typed: str) -> dict[Any, Any]:
+        """Add one point, given by its typed or clicked pixel."""
 
-    def open_files(self, secret: str, pixels: Pixels, event: gr.SelectData) -> Any:
-        """Files with what was measured, as soon as their tab is opened."""
-        shown = self.shown_by(secret)
-        if shown is None or event.value != FILES_TAB:
+        def added(result: Result) -> list[tuple[int, int]]:
+            pixel = pixel_of(typed)
+            results.check_pixel(result.shown, pixel)
+            return [*result.pixels, pixel]
+
+        return self.measure(request, secret, added)
+
+    def undo_point(self, request: gr.Request, secret: str) -> dict[Any, Any]:
+        """Remove the last point."""
+        return self.measure(request, secret, lambda result: result.pixels[:-1])
+
+    def clear_points(self, request: gr.Request, secret: str) -> dict[Any, Any]:
+        """Remove all points."""
+        return self.measure(request, secret, lambda _: [])
+
+    def open_tab(self, request: gr.Request, secret: str, event: gr.SelectData) -> Any:
+        """Remember the open tab; write the measurements to the files when the Files tab is opened."""
+        session = self.sessions.of(request.session_hash)
+        session.tab = str(event.value)
+        result = self.sessions.result(session)
+        if result is None or session.tab != FILES_TAB or secret != session.secret:
             return gr.skip()
-        return look.files(results.files_of(shown, pixels))
+        return _files(result)["files"]
 
     def leave(self, request: gr.Request) -> None:
-        """End what a closed tab had."""
+        """Stop the run of a closed tab, and delete its data."""
         self.sessions.leave(request.session_hash)
 
 
-def _wire_run(desk: _Desk, examples: gr.Gallery) -> None:
-    """What happens from a click on an example or on the button to the result."""
-    form, panels, memory = desk.form, desk.panels, desk.memory
+def _measurable(shown: Shown, request: Request) -> list[tuple[int, int]]:
+    """Return the ends of the known length if both have a depth, so that the result shows them."""
+    try:
+        for pixel in request.pixels:
+            results.check_pixel(shown, pixel)
+    except PageError:
+        return []
+    return list(request.pixels)
+
+
+def pixel_of(typed: str | None) -> tuple[int, int]:
+    """Return the pixel nearest to typed coordinates, such as "320, 240" or "1.5 2.5".
+
+    Raises:
+        PageError: They are not two numbers.
+    """
+    words = re.split(r"[\s,;]+", (typed or "").strip(" ()[],;"))
+    try:
+        x, y = (math.floor(float(word) + 0.5) for word in words)
+    except (ValueError, OverflowError):
+        shown = f", not {typed.strip()[:40]!r}" if typed and typed.strip() else ""
+        raise PageError(f"Enter two numbers, x and y, such as 320, 240{shown}.") from None
+    return x, y
+
+
+def _wire_run(desk: _Handlers, examples: gr.Gallery) -> None:
+    """Connect the examples and the run button to the estimation."""
+    form = desk.form
     fields_of_form = list(form.fields.values())
+    outputs = [*desk.of_result(), desk.progress, form.stop]
+    by_client = gr.Button(visible=False)  # first, so that the endpoint gets its name
+    by_client.click(desk.estimate_at_once, fields_of_form, desk.of_result(), api_name="estimate")
+    shows: dict[str, Any] = {
+        "concurrency_limit": None,
+        "show_progress": "full",
+        "show_progress_on": desk.progress,
+        "trigger_mode": "multiple",  # the last of several clicks wins
+        "js": templates.RUN_BEGINS,
+        "api_visibility": "private",
+    }
+    for event in (
+        form.run.click(desk.estimate, fields_of_form, outputs, **shows),
+        examples.select(desk.run_example, None, [*fields_of_form, *outputs], **shows),
+    ):
+        event.then(None, js=templates.RUN_ENDS, queue=False, api_visibility="private")
+    # At once, so that a reload while the files are written finds the result.
+    desk.secret.change(None, desk.secret, js=templates.KEEP_SECRET, queue=False, api_visibility="private")
+    form.stop.click(desk.stop, **QUICK)
 
-    def take(event: gr.SelectData) -> list[Any]:
-        return form.example(int(event.index))
 
-    chosen = examples.select(take, outputs=fields_of_form, **QUICK)
-    for name, begins in (("estimate", form.run.click), ("example", chosen.then)):
-        begins(desk.come, outputs=panels.status, js=look.RUN_BEGINS, **QUICK).then(
-            desk.estimate,
-            fields_of_form,
-            desk.of_result(),
-            concurrency_limit=None,
-            show_progress="full",
-            show_progress_on=panels.status,
-            api_name=name if name == "estimate" else False,
-        ).then(None, memory.secret, js=look.RUN_ENDS, queue=False)
-    form.stop.click(desk.stop, outputs=panels.status, **QUICK)
-
-
-def _wire_form(desk: _Desk) -> None:
-    """What happens when files come, change or go."""
+def _wire_form(desk: _Handlers) -> None:
+    """Connect the handlers of uploads and of changed inputs."""
     drops = [desk.form.fields[name] for name in ("left", "right", "calib")]
     gr.on([field.upload for field in drops], desk.note_uploads, drops, None, **QUICK)
     changes = [event for field in drops for event in (field.upload, field.clear)]
-    gr.on(changes, None, js=look.CHANGED, queue=False)
+    gr.on(changes, None, js=templates.CHANGED, queue=False)
 
 
-def _wire_measuring(desk: _Desk) -> None:
-    """What happens when points are chosen, in the 3D view, on the photograph or by their numbers."""
-    panels, memory = desk.panels, desk.memory
-    measured = [memory.pixels, panels.marks_data, panels.headline, panels.picture, panels.readings]
-    picked = [memory.secret, memory.pixels, panels.picked]
-    panels.pick.click(desk.add_point, picked, measured, js=look.PICKED, **TAPS)
+def _wire_measuring(desk: _Handlers) -> None:
+    """Connect the handlers of measured points: clicks in the 3D view or on the image, and typed pixels."""
+    panels, secret = desk.panels, desk.secret
+    measured = [panels.marks_data, panels.headline, panels.readings]
+    panels.pick.click(desk.add_point, [secret, panels.picked], measured, js=templates.PICKED, **TAPS)
     typed = [panels.add.click, panels.pixel.submit]
-    gr.on(typed, desk.add_point, [memory.secret, memory.pixels, panels.pixel], measured, **QUICK)
-    panels.clear.click(desk.clear_points, memory.secret, measured, **QUICK)
-    panels.tabs.select(desk.open_files, [memory.secret, memory.pixels], panels.files, **QUICK)
+    gr.on(typed, desk.add_point, [secret, panels.pixel], measured, **QUICK)
+    gr.on([button.click for button in panels.undo], desk.undo_point, secret, measured, **QUICK)
+    gr.on([button.click for button in panels.clear], desk.clear_points, secret, measured, **QUICK)
+    panels.tabs.select(desk.open_tab, secret, panels.files, **QUICK)
+
+
+def _point_buttons(drawn: dict[str, Any]) -> None:
+    """Draw the buttons that remove points."""
+    with gr.Row():
+        drawn["undo"] = (*drawn.get("undo", ()), gr.Button("Undo point", size="sm", min_width=90))
+        drawn["clear"] = (*drawn.get("clear", ()), gr.Button("Clear points", size="sm", min_width=90))
 
 
 def _build_panels(html: dict[str, str]) -> Panels:
@@ -337,21 +474,24 @@ def _build_panels(html: dict[str, str]) -> Panels:
     with gr.Tabs() as drawn["tabs"]:
         with gr.Tab("3D"):
             drawn["headline"] = gr.HTML(html["headline"], elem_id="headline")
-            gr.HTML(look.VIEWER, elem_id="scene")
+            gr.HTML(templates.VIEWER, elem_id="scene")
+            _point_buttons(drawn)
         with gr.Tab("Depth"):
             drawn["depth"] = gr.HTML(html["depth"], elem_id="depth")
             drawn["legend"] = gr.HTML(html["legend"], elem_id="depth-legend")
         with gr.Tab("Measure"), gr.Row():
             with gr.Column(scale=5, min_width=280):
-                drawn["picture"] = gr.HTML(html["picture"], elem_id="measure-picture")
+                gr.HTML(templates.zoomable("measure"), elem_id="measure-image")
             with gr.Column(scale=3, min_width=240):
                 drawn["readings"] = gr.HTML(html["readings"], elem_id="readings")
                 drawn["pixel"] = gr.Textbox(
-                    label="A point by its pixel: x, y", placeholder="320, 240", max_lines=1, elem_id="pixel"
+                    label="Add a point by its pixel (x, y)",
+                    placeholder="320, 240",
+                    max_lines=1,
+                    elem_id="pixel",
                 )
-                with gr.Row():
-                    drawn["add"] = gr.Button("Add point", size="sm", elem_id="add-point")
-                    drawn["clear"] = gr.Button("Clear points", size="sm")
+                drawn["add"] = gr.Button("Add point", size="sm", elem_id="add-point")
+                _point_buttons(drawn)
         with gr.Tab("Confidence"):
             drawn["confidence"] = gr.HTML(html["confidence"], elem_id="confidence")
         with gr.Tab(FILES_TAB):
@@ -361,27 +501,30 @@ def _build_panels(html: dict[str, str]) -> Panels:
 
 
 def build_page(priors: Priors) -> gr.Blocks:
-    """The whole page with what a visitor may choose; launch it with ``theme=THEME, css=look.CSS``."""
-    first, sessions = read_first_result(), Sessions(Keeper())
+    """Build the page with these priors to choose from; launch it with ``theme=THEME, css=templates.CSS``."""
+    first = read_first_result()
+    sessions = Sessions(ResultStore(), lambda: Result(first.shown, list(first.pixels)))
     with gr.Blocks(
-        title="Depth in metres from two photographs",
+        title="Metric depth from two images",
         analytics_enabled=False,
         delete_cache=(FORGET_AFTER_S // 10, FORGET_AFTER_S),
         fill_width=True,
     ) as page:
-        gr.HTML(look.HEADER)
-        memory = Memory(gr.Textbox(visible="hidden"), gr.State(first.pixels))
+        gr.HTML(templates.HEADER)
+        secret, by_phone = gr.Textbox(visible="hidden"), gr.Checkbox(visible="hidden")
         with gr.Row(equal_height=False, elem_id="main"):
-            with gr.Column(elem_id="examples-part"):
+            with gr.Column(elem_id="examples-panel"):
                 examples = build_examples()
             with gr.Column(elem_id="results"):
-                panels = _build_panels(_drawn(first.shown, first.pixels))
+                progress = gr.HTML(elem_id="progress")
+                panels = _build_panels({k: v for html in drawn(first) for k, v in html.items()})
             with gr.Column(elem_id="form"):
                 form = build_form(priors)
-        desk = _Desk(first, form, panels, memory, priors, sessions, Turns())
+        desk = _Handlers(form, panels, secret, priors, sessions, RunQueue(), progress)
         _wire_run(desk, examples)
         _wire_form(desk)
         _wire_measuring(desk)
-        page.load(desk.come_back, memory.secret, desk.of_result(), js=look.COME_BACK, **QUICK)
+        restored = [*desk.of_result(), form.fields["camera_input"]]
+        page.load(desk.restore, [secret, by_phone], restored, js=templates.COME_BACK, **QUICK)
         page.unload(desk.leave)
     return page

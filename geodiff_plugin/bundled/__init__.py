@@ -1,4 +1,8 @@
-"""The small prior and the stereo pair that ship with the package, so that everything works offline."""
+"""The small prior and the stereo pairs that ship with the package, for offline use.
+
+Belongs here: these files and their readers. To replace the prior, see examples/training.
+Layer 9: imports ``priors``, ``formats`` and below; ``jobs``, ``app`` and ``cli`` import it.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +20,9 @@ __all__ = ["load_bundled_prior", "no_bars", "open_pipeline"]
 def load_bundled_prior(
     device: str | torch.device | None = None, dtype: torch.dtype = torch.float32
 ) -> MarigoldDepthPipeline:
-    """The small depth prior of this package, a new stock pipeline on every call; nothing is downloaded.
+    """Load the package's small depth prior as a new stock pipeline; downloads nothing.
 
-    ``device`` is the CPU for ``None``; ``OSError`` where the package was installed without its weights.
+    ``device=None`` is the CPU. Raises ``OSError`` if the package was installed without its weights.
     """
     return open_pipeline(BUNDLED_FOLDER, device, dtype)
 
@@ -26,7 +30,7 @@ def load_bundled_prior(
 def open_pipeline(
     folder: str | Path, device: str | torch.device | None = None, dtype: torch.dtype = torch.float32
 ) -> MarigoldDepthPipeline:
-    """Load a folder of the bundled prior, or of one trained like it, offline and without progress bars."""
+    """Load a folder of the bundled prior, or one trained like it, offline and without progress bars."""
     with no_bars():
         pipeline = MarigoldDepthPipeline.from_pretrained(
             str(folder), dtype=dtype, local_files_only=True, trust_remote_code=False

@@ -1,6 +1,11 @@
-"""Captures: many frames of one moving camera, each with depth in metres, and one cloud of all."""
+"""Captures: many frames of one moving camera, each with metric depth, and one fused point cloud.
 
-#: Right views of a frame, at most, where a call does not say.
+Belongs here: the frames of a capture and their neighbours, agreement between their depth maps, and fusion.
+Readers of captures are in ``formats``, solved poses in ``pose``.
+Layer 10: imports ``runtime``, ``pose`` and below; ``jobs`` and ``evaluation`` import it.
+"""
+
+#: Default maximum number of right views of a frame.
 NEIGHBOURS = 5
-#: Known depths of the frames.
+#: Sources of known depths of the frames.
 POINTS = ("tracks", "none", "model", "depth")

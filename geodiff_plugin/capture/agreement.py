@@ -1,4 +1,4 @@
-"""Frames checked against each other's depth: averaged where they agree, outvoted where others agree."""
+"""Compares depth maps of frames: averages depths where they agree, replaces depths outvoted by others."""
 
 from __future__ import annotations
 
@@ -11,190 +11,216 @@ import cv2
 import numpy as np
 import torch
 
-from geodiff_plugin.pose.tracks import LONG_SIDE, grey_image, match_features, sift_features
+from geodiff_plugin.cameras import NEAREST, Camera, joined, keep_nearest
+from geodiff_plugin.pose.tracks import match_features, reduced_grey, sift_features
+from geodiff_plugin.result.sigma import depth_sigma
 from geodiff_plugin.types import DepthFrame
 
-#: Two depths of one point agree within this share.
-SAME_SHARE = 0.06
-#: A frame's depth counts so many times that of another frame, whose pixels are resampled.
+#: Relative tolerance within which two depths of a point agree.
+AGREEMENT_TOLERANCE = 0.06
+#: Weight of a frame's own depth relative to another frame's, whose pixels are resampled.
 OWN_WEIGHT = 2.0
-#: Every depth counts a little, however low its confidence.
-LEAST_WEIGHT = 0.05
-#: Confidence that one agreeing frame adds, as a share of what is missing to 1 and of its own confidence.
-RISES = 0.4
-#: So many other frames must agree with each other to replace a depth that none of them confirms.
-OUTVOTES = 2
-#: Side in pixels of the median that smooths depth around what others replace; OpenCV's largest for floats.
-SMOOTHED = 5
-#: Times that it is taken, one after the other.
-ROUNDS = 3
-#: Frames before and after a frame of a video that it is checked against.
-STEADY = 3
-#: Confidence from which others do not outvote what may have moved.
-SURE = 0.8
-#: The motion of a camera is known if so many matches fit it.
-LEAST_INLIERS = 20
-#: A match fits to within so many pixels of the shrunk pictures.
+#: Minimum weight of a depth, however low its confidence.
+MIN_WEIGHT = 0.05
+#: Fraction of the remaining uncertainty (1 - confidence) removed by an agreeing frame, times its confidence.
+CONFIDENCE_GAIN = 0.4
+#: Number of other frames that must agree with each other to replace an unconfirmed depth.
+MIN_AGREEING = 2
+#: Side in pixels of the median filter around replaced depths; the largest that OpenCV supports for floats.
+MEDIAN_SIZE = 5
+#: Number of iterations of the median filter.
+MEDIAN_ITERATIONS = 3
+#: Number of previous and following video frames that a frame is compared with.
+NEIGHBOUR_FRAMES = 3
+#: Confidence from which other frames do not outvote a depth in a scene that may move.
+MIN_STATIC_CONFIDENCE = 0.8
+#: Minimum number of inlier matches for a camera motion.
+MIN_INLIERS = 20
+#: Maximum reprojection error of an inlier match, in pixels of the downscaled images.
 INLIER_PX = 1.5
 
 
 class SeenIn(NamedTuple):
-    """Where another frame's camera sees the points of a frame, ``(H, W)`` each."""
+    """Projection of a frame's points into another frame's camera, ``(H, W)`` each."""
 
-    row: np.ndarray  # of its nearest pixel; 0 outside
+    row: np.ndarray  # row of the nearest pixel; 0 outside
     column: np.ndarray
     z: np.ndarray  # depth in its camera
-    inside: np.ndarray  # whether in its picture
+    inside: np.ndarray  # whether inside the image
 
 
 def seen_in(frame: DepthFrame, other: DepthFrame) -> SeenIn:
-    """Where the camera of ``other`` sees the points of ``frame``."""
-    T = np.linalg.inv(other.E)
-    points = (frame.world() @ T[:3, :3].T + T[:3, 3]) @ other.K.T
-    z = points[:, 2].reshape(frame.depth.shape)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = (points[:, axis].reshape(z.shape) / z for axis in (0, 1))
-        inside = (z > 1e-6) & (u > -0.5) & (v > -0.5)
-        inside &= (u < other.depth.shape[1] - 0.5) & (v < other.depth.shape[0] - 0.5)
-    row, column = (np.rint(np.where(inside, at, 0)).astype(int) for at in (v, u))
+    """Project the points of ``frame`` into the camera of ``other``."""
+    px, z = other.camera.project(other.camera.from_world(frame.world()))
+    inside = other.camera.contains(px) & (frame.depth > 0)
+    column, row = (np.rint(np.where(inside, at, 0)).astype(int) for at in np.moveaxis(px, -1, 0))
     return SeenIn(row, column, z, inside)
 
 
 def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False) -> DepthFrame:
-    """A frame, with its depth averaged with that of others where they agree, ``confirmed`` and ``observers``.
+    """Average a frame's depth with agreeing depth of other frames; set ``confirmed`` and ``observers``.
 
-    A depth that no other frame confirms gives way to a depth on which several others agree with more
-    weight; where things may be ``moving``, only if its confidence is low. Inverse depths are averaged; a
-    median smooths them around what others replace.
+    Replaces a depth that no other frame confirms by one on which several others agree with more weight; if
+    objects may be ``moving``, only at low confidence. Averages inverse depths, and applies a median filter
+    around replaced depths.
 
-    Source: Merrell et al. 2007, S4: depth maps rendered into one view, supported by those that agree.
+    Source: Merrell et al. 2007, S4: depth maps rendered into one view, with support from agreeing maps.
     """
-    weight = OWN_WEIGHT * (LEAST_WEIGHT + frame.confidence)
-    total, above = weight.copy(), weight / frame.depth
+    weight = OWN_WEIGHT * (MIN_WEIGHT + frame.confidence)
+    known = frame.depth > 0  # pixels that are not valid have no depth
+    total, above = weight.copy(), weight / np.where(known, frame.depth, 1.0)
     confirmed, observers = (np.zeros(frame.depth.shape, np.uint8) for _ in range(2))
     missing = 1.0 - frame.confidence
     for other in others:
-        said = _said_by(other, frame)
-        observers += said.seen
-        confirmed += said.agrees
-        more = np.where(said.agrees, LEAST_WEIGHT + said.confidence, 0.0)
+        found = _compare(other, frame)
+        observers += found.seen
+        confirmed += found.agrees
+        more = np.where(found.agrees, MIN_WEIGHT + found.confidence, 0.0)
         total += more
-        above += more / np.where(said.agrees, said.depth, 1.0)
-        missing = missing * np.where(said.agrees, 1.0 - RISES * said.confidence, 1.0)
+        above += more / np.where(found.agrees, found.depth, 1.0)
+        missing = missing * np.where(found.agrees, 1.0 - CONFIDENCE_GAIN * found.confidence, 1.0)
     inverse, confidence = above / total, 1.0 - missing
-    alone = (confirmed == 0) & (frame.confidence < (SURE if moving else np.inf))
-    seen_by = [rendered(other, frame, other.confidence) for other in others] if alone.any() else []
-    for depth, _ in seen_by:  # a surface of another frame before ours speaks against ours
-        observers += alone & (depth > 0) & (depth < (1 - SAME_SHARE) * frame.depth)
-    if len(seen_by) >= OUTVOTES:
-        vote = _vote(seen_by, alone)
-        lost = (vote.votes >= OUTVOTES) & (vote.weight > weight[alone])
-        at = np.flatnonzero(alone)[lost]
+    unconfirmed = (
+        known & (confirmed == 0) & (frame.confidence < (MIN_STATIC_CONFIDENCE if moving else np.inf))
+    )
+    seen_by = [rendered(other, frame, other.confidence) for other in others] if unconfirmed.any() else []
+    for depth, _ in seen_by:  # a surface in front of ours contradicts it
+        observers += unconfirmed & (depth > 0) & (depth < (1 - AGREEMENT_TOLERANCE) * frame.depth)
+    if len(seen_by) >= MIN_AGREEING:
+        vote = _vote(seen_by, unconfirmed)
+        lost = (vote.supporters >= MIN_AGREEING) & (vote.weight > weight[unconfirmed])
+        at = np.flatnonzero(unconfirmed)[lost]
         inverse.flat[at] = vote.inverse_depth[lost]
         confidence.flat[at] = vote.confidence[lost]
-        confirmed.flat[at] = vote.votes[lost]
-        inverse = _smoothed_around(inverse, at)
+        confirmed.flat[at] = vote.supporters[lost]
+        inverse = _median_around(inverse, at, known)
+    depth = np.where(known, 1.0 / inverse, 0.0).astype(np.float32)
     return replace(
         frame,
-        depth=(1.0 / inverse).astype(np.float32),
+        depth=depth,
         confidence=confidence.astype(np.float32),
+        sigma=_agreed_sigma(frame, depth, confidence),
         confirmed=confirmed,
         observers=np.maximum(observers, confirmed),
     )
 
 
-def _smoothed_around(inverse: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Inverse depth ``(H, W)`` with a median at and beside the pixels of flat indices ``at``."""
+def _agreed_sigma(frame: DepthFrame, depth: np.ndarray, confidence: np.ndarray) -> np.ndarray | None:
+    """Return the standard deviation ``(H, W)`` of a frame's depth after agreement; ``None`` without one.
+
+    Agreeing frames raise the confidence, which bounds it (``depth_sigma`` without geometry). A depth that was
+    replaced has the bound. The errors of poses are common to all frames, so averaging does not reduce it
+    further.
+    """
+    if frame.sigma is None:
+        return None
+    bound = depth_sigma(depth, confidence)
+    replaced = np.abs(depth - frame.depth) > AGREEMENT_TOLERANCE * frame.depth
+    return np.where(replaced | ~(frame.sigma < bound), bound, frame.sigma).astype(np.float32)
+
+
+def _median_around(inverse: np.ndarray, at: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Median-filter inverse depth ``(H, W)`` at and next to the pixels with flat indices ``at``.
+
+    Only where the depth of the whole window is ``known``.
+    """
     replaced = np.zeros(inverse.shape, np.uint8)
     replaced.flat[at] = 1
     near = cv2.dilate(replaced, np.ones((3, 3), np.uint8)) > 0
-    for _ in range(ROUNDS):
-        inverse = np.where(near, cv2.medianBlur(inverse.astype(np.float32), SMOOTHED), inverse)
+    if not known.all():
+        near &= cv2.erode(known.astype(np.uint8), np.ones((MEDIAN_SIZE, MEDIAN_SIZE), np.uint8)) > 0
+    for _ in range(MEDIAN_ITERATIONS):
+        inverse = np.where(near, cv2.medianBlur(inverse.astype(np.float32), MEDIAN_SIZE), inverse)
     return inverse
 
 
-class _Said(NamedTuple):
-    """What another frame says of the point that each pixel of a frame shows, ``(H, W)`` each."""
+class _Comparison(NamedTuple):
+    """Another frame's depth of the point at each pixel of a frame, ``(H, W)`` each."""
 
     depth: np.ndarray  # in the frame's view
     confidence: np.ndarray
-    seen: np.ndarray  # whether it sees the point, or a surface before it
+    seen: np.ndarray  # whether it observes the point, or a surface in front of it
     agrees: np.ndarray  # whether both depths agree
 
 
-def _said_by(other: DepthFrame, frame: DepthFrame) -> _Said:
+def _compare(other: DepthFrame, frame: DepthFrame) -> _Comparison:
     row, column, z, seen = seen_in(frame, other)
-    there = other.depth[row, column].astype(np.float64)
-    moved = np.linalg.inv(frame.E) @ other.E
-    rays = np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(other.K).T
-    points = (rays * there[..., None]) @ moved[:3, :3].T + moved[:3, 3]
-    depth = np.where(np.abs(points[..., 2]) < 1e-6, 1e-6, points[..., 2])
-    # The nearest pixel lies up to half a pixel beside the point, so only depths are compared.
-    same = seen & (np.abs(there / z - 1) < SAME_SHARE) & (np.abs(depth / frame.depth - 1) < SAME_SHARE)
-    # A point behind what the other frame sees is hidden from it, which says nothing against ours.
-    return _Said(depth, other.confidence[row, column], seen & (there > (1 - SAME_SHARE) * z), same)
+    other_depth = other.depth[row, column].astype(np.float64)
+    points = other.camera.to_world(other.camera.rays(joined(column, row)) * other_depth[..., None])
+    depth = frame.camera.from_world(points)[..., 2]
+    depth = np.where(np.abs(depth) < NEAREST, NEAREST, depth)
+    # The nearest pixel is up to half a pixel off the point, so only depths are compared.
+    same = (
+        seen
+        & (np.abs(other_depth / z - 1) < AGREEMENT_TOLERANCE)
+        & (np.abs(depth / np.where(frame.depth > 0, frame.depth, 1.0) - 1) < AGREEMENT_TOLERANCE)
+    )
+    # A point behind the other frame's surface is occluded in that frame, which does not contradict it.
+    return _Comparison(
+        depth, other.confidence[row, column], seen & (other_depth > (1 - AGREEMENT_TOLERANCE) * z), same
+    )
 
 
 def rendered(other: DepthFrame, frame: DepthFrame, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Another frame's depth, and ``values (H, W, ...)`` of its pixels, as a frame's camera sees them.
+    """Render another frame's depth and ``values (H, W, ...)`` of its pixels into a frame's camera.
 
-    The nearest point is seen. Gaps of a pixel or two between the points are filled; 0 where nothing is seen.
+    Z-buffered: the nearest point wins. Fills gaps of a pixel or two; 0 where there is no point.
     """
     row, column, z, inside = seen_in(other, frame)
-    order = np.argsort(-z[inside], kind="stable")  # the nearest is written last
-    at = row[inside][order], column[inside][order]
-    maps = np.zeros(frame.depth.shape), np.zeros((*frame.depth.shape, *values.shape[2:]), values.dtype)
-    for into, of in zip(maps, (z, values), strict=True):
-        into[at] = of[inside][order]
     height, width = frame.depth.shape
+    cells, nearest = (row * width + column)[inside], np.full(frame.depth.size, np.inf)
+    keep_nearest(torch.from_numpy(nearest), torch.from_numpy(cells), torch.from_numpy(z[inside]))
+    shown = z[inside] == nearest[cells]
+    maps = np.zeros(frame.depth.shape), np.zeros((*frame.depth.shape, *values.shape[2:]), values.dtype)
+    for target, source in zip(maps, (z, values), strict=True):
+        target[row[inside][shown], column[inside][shown]] = source[inside][shown]
     for v, u in ((0, 1), (2, 1), (1, 0), (1, 2)):
         gaps = maps[0] == 0
-        for into in maps:
-            around = np.pad(into, [(1, 1), (1, 1), (0, 0)][: into.ndim])
-            into[gaps] = around[v : v + height, u : u + width][gaps]
+        for target in maps:
+            around = np.pad(target, [(1, 1), (1, 1), (0, 0)][: target.ndim])
+            target[gaps] = around[v : v + height, u : u + width][gaps]
     return maps
 
 
 class _Vote(NamedTuple):
-    """The depth that most of the other frames agree on, ``(n,)`` each."""
+    """The depth supported by most of the other frames, ``(n,)`` each."""
 
-    votes: np.ndarray  # number of frames that agree
-    weight: np.ndarray  # of all of them
+    supporters: np.ndarray  # number of frames that agree
+    weight: np.ndarray  # total weight of these frames
     inverse_depth: np.ndarray  # their mean
-    confidence: np.ndarray  # their joint one
+    confidence: np.ndarray  # their joint confidence
 
 
 def _vote(seen_by: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> _Vote:
-    """What the other frames agree on at the ``n`` pixels of a mask, by their depth and confidence."""
+    """Find the depth that other frames agree on at the ``n`` pixels of a mask, from depth and confidence."""
     depths = np.stack([depth[mask] for depth, _ in seen_by])
-    sures = np.stack([confidence[mask] for _, confidence in seen_by])
-    weights = np.where(depths > 0, LEAST_WEIGHT + sures, 0.0)
+    confidences = np.stack([confidence[mask] for _, confidence in seen_by])
+    weights = np.where(depths > 0, MIN_WEIGHT + confidences, 0.0)
     inverse = 1.0 / np.where(depths > 0, depths, 1.0)
     best = _Vote(*(np.zeros(depths.shape[1]) for _ in _Vote._fields))
     for candidate in range(len(depths)):
-        same = np.abs(inverse / inverse[candidate] - 1) < SAME_SHARE
+        same = np.abs(inverse / inverse[candidate] - 1) < AGREEMENT_TOLERANCE
         same &= (depths > 0) & (depths[candidate] > 0)
         weight = (weights * same).sum(0)
         mean = (weights * same * inverse).sum(0) / np.maximum(weight, 1e-9)
-        sure = 1.0 - np.where(same, 1.0 - RISES * sures, 1.0).prod(0)
-        better, by_these = weight > best.weight, _Vote(same.sum(0), weight, mean, sure)
-        best = _Vote(*(np.where(better, new, old) for new, old in zip(by_these, best, strict=True)))
-    return best._replace(votes=best.votes.astype(np.uint8))
+        confidence = 1.0 - np.where(same, 1.0 - CONFIDENCE_GAIN * confidences, 1.0).prod(0)
+        better, candidate_vote = weight > best.weight, _Vote(same.sum(0), weight, mean, confidence)
+        best = _Vote(*(np.where(better, new, old) for new, old in zip(candidate_vote, best, strict=True)))
+    return best._replace(supporters=best.supporters.astype(np.uint8))
 
 
 def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np.ndarray]]:
-    """Camera-to-world poses of a video's frames from their matches and depth, a list for every scene.
+    """Estimate camera-to-world poses of a video's frames from matches and depth, as a list per scene.
 
-    Frames come in order with their pictures ``(H, W, 3)`` in [0, 1]; their ``E`` is ignored. Where no motion
-    fits, another scene begins. A scene's world is the camera of its first frame.
+    Frames are in order with their images ``(H, W, 3)`` in [0, 1]; their ``E`` is ignored. If no camera motion
+    fits, a new scene starts. The world frame of a scene is the camera of its first frame.
     """
     scenes = list[list[np.ndarray]]()
-    before: _Picture | None = None
-    for frame, picture in frames:
-        image, factor = torch.from_numpy(picture).permute(2, 0, 1), LONG_SIDE / max(picture.shape)
-        grey, K = grey_image(image, torch.from_numpy(frame.K), min(1.0, factor))
+    before: _Image | None = None
+    for frame, image in frames:
+        grey, camera, _ = reduced_grey(torch.from_numpy(image).permute(2, 0, 1), frame.camera)
         depth = cv2.resize(frame.depth, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        seen = _Picture(sift_features(grey), K, depth)
+        seen = _Image(sift_features(grey), camera, depth)
         T = None if before is None else _motion(before, seen)
         if T is None:
             scenes.append([np.eye(4)])
@@ -204,45 +230,48 @@ def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np
     return scenes
 
 
-class _Picture(NamedTuple):
-    """What the motion of a camera is found by."""
+class _Image(NamedTuple):
+    """Features, camera and depth used to estimate the camera motion."""
 
-    features: tuple[np.ndarray, np.ndarray]  # of ``sift_features``
-    K: np.ndarray  # (3, 3) pixels
-    depth: np.ndarray  # (H, W) on its grid
+    features: tuple[np.ndarray, np.ndarray]  # from ``sift_features``
+    camera: Camera
+    depth: np.ndarray  # (H, W) on the grid of the camera
 
 
-def _motion(before: _Picture, after: _Picture) -> np.ndarray | None:
-    """``T (4, 4)`` from the camera before to the one after; ``None`` where too few matches fit one."""
+def _motion(before: _Image, after: _Image) -> np.ndarray | None:
+    """Return ``T (4, 4)`` from the previous camera to the next; ``None`` if too few matches fit a motion."""
     pairs = match_features(before.features, after.features)
-    if len(pairs) < LEAST_INLIERS:
+    if len(pairs) < MIN_INLIERS:
         return None
     px, seen = before.features[0][pairs[:, 0], :2], after.features[0][pairs[:, 1], :2]
     column, row = np.rint(px).astype(int).clip(0, np.array(before.depth.shape[::-1]) - 1).T
-    points = np.c_[px, np.ones(len(px))] @ np.linalg.inv(before.K).T * before.depth[row, column, None]
-    fits, turn, shift, inliers = cv2.solvePnPRansac(points, seen, after.K, None, reprojectionError=INLIER_PX)
-    if not fits or len(inliers) < LEAST_INLIERS:
+    points, K = before.camera.rays(px) * before.depth[row, column, None], after.camera.K
+    fits, rotation, translation, inliers = cv2.solvePnPRansac(
+        points, seen, K, None, reprojectionError=INLIER_PX
+    )
+    if not fits or len(inliers) < MIN_INLIERS:
         return None
     at = inliers[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points[at], seen[at], after.K, None, turn, shift)
+    rotation, translation = cv2.solvePnPRefineLM(points[at], seen[at], K, None, rotation, translation)
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
     return T
 
 
-def steadied(
+def temporally_smoothed(
     scenes: Sequence[Sequence[np.ndarray]], load: Callable[[int], DepthFrame]
 ) -> Iterator[DepthFrame]:
-    """Every frame of a video in order, agreed with those before and after it in its scene.
+    """Smooth the depth of a video temporally: compare every frame with its neighbours in its scene, in order.
 
-    ``scenes`` are of ``scene_poses``; ``load(i)`` returns frame i, whose ``E`` is ignored.
+    ``scenes`` is the result of ``scene_poses``; ``load(i)`` returns frame i, whose ``E`` is ignored.
     """
     poses = [(number, E) for number, scene in enumerate(scenes) for E in scene]
 
-    @lru_cache(maxsize=2 * STEADY + 1)
+    @lru_cache(maxsize=2 * NEIGHBOUR_FRAMES + 1)
     def posed(i: int) -> DepthFrame:
-        return replace(load(i), E=poses[i][1])
+        frame = load(i)
+        return replace(frame, camera=replace(frame.camera, E=poses[i][1]))
 
     for i, (scene, _) in enumerate(poses):
-        near = range(max(0, i - STEADY), min(len(poses), i + STEADY + 1))
+        near = range(max(0, i - NEIGHBOUR_FRAMES), min(len(poses), i + NEIGHBOUR_FRAMES + 1))
         yield agreed(posed(i), [posed(j) for j in near if j != i and poses[j][0] == scene], moving=True)

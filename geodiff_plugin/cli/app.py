@@ -1,4 +1,4 @@
-"""The ``geodiff`` command: its subcommands, which import torch when they run, and options of most of them."""
+"""Define the ``geodiff`` command and its subcommands, which import torch only when they run."""
 
 from __future__ import annotations
 
@@ -10,48 +10,55 @@ from collections.abc import Callable
 from dataclasses import MISSING, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
+import click
 
-from geodiff_plugin._lazy import imported, uncollected
+from geodiff_plugin._internal.lazy import fewer_imports, gc_frozen, imported
 from geodiff_plugin.cli.commands import new_group
-from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, start_pair, with_folder
-from geodiff_plugin.jobs.telling import say, silent
+from geodiff_plugin.jobs import (
+    CaptureOptions,
+    DepthOptions,
+    LiveOptions,
+    say,
+    silent,
+    start_pair,
+    with_folder,
+)
 from geodiff_plugin.options import (
+    DTYPES,
     OUTPUT,
     SPACES,
     Command,
     PriorOptions,
     SpeedOptions,
-    declare,
-    help_of,
 )
+from geodiff_plugin.settings import setting, settings_of
 
-_out = partial(declare, panel=OUTPUT)
+_out = partial(setting, section=OUTPUT)
 
 
 def _imported(where: str) -> Any:
-    """As ``imported``, with threads as a command wants them."""
-    # OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
-    # wait for; asleep they cost one call in ten on an idle machine and save half of it on a busy one.
+    """Import an object like ``imported``, with the thread settings of a command."""
+    # Waiting OpenMP threads spin by default, which on a busy machine takes cores from the threads they wait
+    # for. Passive waiting makes a call 10 % slower on an idle machine and twice as fast on a busy one.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    with uncollected():
+    with gc_frozen(), fewer_imports():
         return imported(where)
 
 
 def _later(where: str) -> Callable[[Any], None]:
-    """Calls such a function with the values of the options by their names."""
+    """Create a command function that imports ``where`` and calls it with the options as keywords."""
     return lambda options: _imported(where)(**vars(options))
 
 
 def _depth(options: DepthOptions) -> None:
-    from geodiff_plugin.formats.recordings import is_bag
-    from geodiff_plugin.jobs.pairs import is_many, start_many
+    from geodiff_plugin.formats import is_bag
+    from geodiff_plugin.jobs import is_many, start_many
 
     if not is_bag(options.left):
         names = ("topic_left", "topic_right", "tolerance", "encoding")
-        options.refuse(names, "{} is for bags, and LEFT is none.")
+        options.raise_input_error(names, "{} needs a bag as LEFT.")
     if is_bag(options.left):
         _imported("cli.run.run_bag")(options)
     elif is_many(options.left):
@@ -60,12 +67,20 @@ def _depth(options: DepthOptions) -> None:
         to_parquet = options.engine == "ray" and options.layout != "folders"
         _imported("cli.run.run_parquet" if to_parquet else "cli.run.run_many")(options, refs)
     else:
-        options.refuse(["steady"], "{} needs frames in order: folders, a list, videos or a bag.")
-        options.refuse(["shard", "engine"], "{} is for many pairs: give folders, a list or videos.")
+        options.raise_input_error(
+            ["temporal_smoothing"], "{} needs a sequence of frames: folders, a list, videos or a bag."
+        )
+        options.raise_input_error(["offset"], "{} applies to two videos.")
+        options.raise_input_error(["shard", "engine"], "{} needs many pairs: give folders, a list or videos.")
         options = with_folder(options, "geodiff-out")
         with start_pair(options) as folder:
             started = time.perf_counter()
             _imported("cli.run.run_depth")(options, folder, started)
+
+
+def _live(options: LiveOptions) -> None:
+    options.check_all()
+    _imported("cli.live.run_live")(options)
 
 
 def _capture(options: CaptureOptions) -> None:
@@ -75,11 +90,11 @@ def _capture(options: CaptureOptions) -> None:
 @dataclass(frozen=True, kw_only=True)
 class _Demo:
     out: Path | None = _out(
-        None, "Output folder (default: geodiff-demo, with a number if that exists).", "--out", "-o"
+        None, "Output folder (default: geodiff-demo, numbered if it exists).", "--out", "-o"
     )
-    overwrite: bool = _out(False, "Write into a folder that holds files.")
-    quiet: bool = _out(False, "Show no progress bar.", "--quiet", "-q")
-    real: bool = declare(False, "Run on three pairs of a real stereo camera instead; no truth is known.")
+    overwrite: bool = _out(False, "Write into a non-empty folder.")
+    quiet: bool = _out(False, "Hide the progress bar.", "--quiet", "-q")
+    real: bool = setting(False, "Run on three pairs of a real stereo camera, without ground truth.")
 
     def run(self) -> None:
         bundled = Path(__file__).resolve().parents[1] / "bundled"
@@ -92,7 +107,7 @@ class _Demo:
                 _imported("cli.demo.run_demo")(options, folder)
 
     def _options(self, pair: Path) -> DepthOptions:
-        """What ``geodiff depth`` takes to run on such a folder."""
+        """Return the options of ``geodiff depth`` for a bundled pair."""
         left, right, calib = (pair / name for name in ("left.png", "right.png", "calib.txt"))
         options = DepthOptions(
             left=left,
@@ -108,106 +123,107 @@ class _Demo:
 
 @dataclass(frozen=True, kw_only=True)
 class _Bench(SpeedOptions, PriorOptions):
-    """What ``geodiff bench`` is told."""
+    """Options of ``geodiff bench``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Info:
-    prior: str | None = declare(None, "Also describe this prior.")
-    space: str | None = declare(
-        None, "What its map is affine in, where its folder does not say.", choices=SPACES
+    prior: str | None = setting(None, "Also describe this prior.")
+    space: str | None = setting(
+        None, "Space in which it is affine-invariant (default: from its config).", choices=SPACES
     )
-    knobs: bool = declare(False, "Instead list the knobs of the guidance, with default, range and meaning.")
+    parameters: bool = setting(False, "List the guidance parameters with default, range and meaning instead.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Video:
-    frames: tuple[Path, ...] = declare(
-        MISSING, "Folders of geodiff depth, or depth maps as .npy, in order.", "", metavar="FRAME"
+    frames: tuple[Path, ...] = setting(
+        MISSING, "Output folders of geodiff depth, or depth maps as .npy, in order.", "", metavar="FRAME"
     )
-    out: Path = _out(Path("depth.webp"), "The video: .mp4, .webp or .gif.", "--out", "-o")
-    fps: float = declare(10.0, "Frames per second.")
-    near: float | None = declare(
-        None, "Near end of the colours, in metres (default: the nearest depth of the maps)."
+    out: Path = _out(Path("depth.webp"), "Output video: .mp4, .webp or .gif.", "--out", "-o")
+    fps: float = setting(10.0, "Frames per second.")
+    near: float | None = setting(
+        None, "Nearest depth of the colour map, in metres (default: nearest depth of all maps)."
     )
-    far: float | None = declare(
-        None, "Far end of the colours, in metres (default: the farthest depth of the maps)."
+    far: float | None = setting(
+        None, "Farthest depth of the colour map, in metres (default: farthest depth of all maps)."
     )
     overwrite: bool = _out(False, "Replace an existing file.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Submit:
-    results: tuple[Path, ...] = declare(MISSING, "Folders that geodiff depth wrote.", "", metavar="RESULT")
-    to: str = declare(MISSING, "Benchmark: middlebury or eth3d.", choices=("middlebury", "eth3d"))
+    results: tuple[Path, ...] = setting(MISSING, "Output folders of geodiff depth.", "", metavar="RESULT")
+    to: str = setting(MISSING, "Benchmark: middlebury or eth3d.", choices=("middlebury", "eth3d"))
     out: Path = _out(MISSING, "Output folder.", "--out", "-o")
-    method: str = declare("GeoDiff", "Name of the method in the files of Middlebury.")
+    method: str = setting("GeoDiff", "Method name in Middlebury files.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Merge:
-    folder: Path = declare(MISSING, "Folder that geodiff depth --shard wrote to.", "", metavar="DIR")
-    json: bool = _out(False, "Print the rows as JSON instead of the table.")
+    folder: Path = setting(MISSING, "Output folder of geodiff depth --shard.", "", metavar="DIR")
+    json: bool = _out(False, "Print the rows as JSON instead of a table.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Page:
-    prior: tuple[str, ...] = declare(
-        ("bundled",), "Prior that visitors may choose; repeat it to offer several."
-    )
-    device: str = declare("auto", help_of("device"))
-    host: str = declare("127.0.0.1", "Address to listen on; 0.0.0.0 lets other machines in.")
-    port: int | None = declare(None, "Port (default: the first free one).", low=1, high=65535)
-    browser: bool = declare(False, "Open the page in a browser.")
+    prior: tuple[str, ...] = setting(("bundled",), "Prior that visitors can select; repeatable.")
+    device: str = setting("auto", settings_of(PriorOptions)["device"].help)
+    dtype: str = setting("float32", settings_of(PriorOptions)["dtype"].help, choices=DTYPES)
+    host: str = setting("127.0.0.1", "Address to listen on; 0.0.0.0 allows other machines.")
+    port: int | None = setting(None, "Port (default: first free port).", low=1, high=65535)
+    browser: bool = setting(False, "Open the web app in a browser.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Convert:
-    paths: tuple[Path, ...] = declare(
+    paths: tuple[Path, ...] = setting(
         MISSING,
-        "SRC DST: a checkpoint (.ckpt, .pth) or a folder of .bin weights, and the new folder for --prior. Or "
-        "marigold-v2 BASE CHECKPOINT DST: a folder of Qwen-Image-Edit-2509, the trainables.safetensors of "
-        "Marigold V2, and the new folder.",
+        "SRC DST: a checkpoint (.ckpt, .pth) or folder with .bin weights, and the output folder for "
+        "--prior. Or marigold-v2 BASE CHECKPOINT DST: a Qwen-Image-Edit-2509 folder, the "
+        "trainables.safetensors of Marigold V2, and the output folder.",
         "",
         metavar="PATH",
     )
-    part: str | None = declare(
-        None, "What SRC lacks: a file, folder or hub id (docs/reference/priors.md).", "--with"
+    part: str | None = setting(
+        None, "Parts missing in SRC: a file, folder or hub id (docs/reference/priors.md).", "--with"
     )
-    space: str | None = declare(None, "What the map of marigold-v2 is affine in.", choices=SPACES)
+    space: str | None = setting(None, "Space in which marigold-v2 is affine-invariant.", choices=SPACES)
 
 
 COMMANDS = {
     "depth": Command(
         DepthOptions,
         _depth,
-        "Metric depth of LEFT, guided by RIGHT: one pair, or many.\n\n"
+        "Estimate metric depth of LEFT, guided by RIGHT, for one pair or many.\n\n"
         "For example: geodiff depth left.png right.png --calib calib.txt",
     ),
     "capture": Command(
-        CaptureOptions, _capture, "Metric depth of the frames of a capture, and one point cloud."
+        CaptureOptions, _capture, "Estimate metric depth of all frames of a capture, and a fused point cloud."
     ),
-    "demo": Command(_Demo, _Demo.run, "Run on the bundled pair, whose depth is known, or on real pairs."),
+    "live": Command(
+        LiveOptions,
+        _live,
+        "Estimate metric depth of a stereo camera, a video or a stream, frame by frame.\n\n"
+        "For example: geodiff live --source 0 --side-by-side --calib calib.txt",
+    ),
+    "demo": Command(_Demo, _Demo.run, "Run on the bundled pair with ground truth, or on real pairs."),
     "info": Command(_Info, _later("cli.info.run_info"), "Show versions, devices and priors."),
     "bench": Command(
         _Bench,
         lambda options: _imported("cli.demo.run_bench")(options),
-        "Measure how much time guidance adds.",
+        "Measure the overhead of guidance and the throughput.",
     ),
-    "video": Command(_Video, _later("cli.results.run_video"), "Join the depth maps of frames into a video."),
-    "merge": Command(
-        _Merge, _later("cli.results.run_merge"), "Join the tables that geodiff depth --shard wrote."
-    ),
+    "video": Command(_Video, _later("cli.results.run_video"), "Create a video from depth maps."),
+    "merge": Command(_Merge, _later("cli.results.run_merge"), "Merge the tables of geodiff depth --shard."),
     "submit": Command(
         _Submit,
         _later("cli.results.run_submit"),
-        "Write results in the form in which Middlebury or ETH3D takes them.",
+        "Export results for Middlebury or ETH3D submission.",
     ),
-    "app": Command(
-        _Page, _later("app.launch.run_app"), "Serve the page that measures in the browser (extra 'app')."
-    ),
+    "app": Command(_Page, _later("app.launch.run_app"), "Launch the web app (needs the extra 'app')."),
     "convert": Command(
-        _Convert, _later("cli.results.run_convert"), "Turn downloaded weights into a folder for --prior."
+        _Convert, _later("cli.results.run_convert"), "Convert downloaded weights into a folder for --prior."
     ),
     "eval": Command(
         None,
@@ -215,37 +231,15 @@ COMMANDS = {
         "Evaluate this package and other methods on data sets.",
     ),
 }
-ABOUT = "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."
-app = new_group(ABOUT, COMMANDS, outermost=True)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version
-
-        typer.echo(f"geodiff-plugin {version('geodiff-plugin')}")
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version",
-            callback=_print_version,
-            is_eager=True,
-            metavar="",
-            help="Print the version and exit.",
-        ),
-    ] = False,
-) -> None:
-    pass
+ABOUT = "Metric depth from two images with known cameras, using any Marigold-style diffusion prior."
+app = click.version_option(package_name="geodiff-plugin", message="%(package)s %(version)s")(
+    new_group(ABOUT, COMMANDS, outermost=True)
+)
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the command line on ``argv``, by default that of the process, and leave by ``SystemExit``."""
+    """Run the command line on ``argv`` (default: ``sys.argv``) and raise ``SystemExit``."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a name that the terminal's encoding lacks is no error
+        if isinstance(stream, io.TextIOWrapper):  # names outside the terminal's encoding are escaped
             stream.reconfigure(errors="backslashreplace")
-    app(args=argv, prog_name="geodiff")
+    app.main(args=argv, prog_name="geodiff")

@@ -1,193 +1,192 @@
-"""Commands of typer from dataclasses of options, each built when it is typed: ``--help`` answers at once."""
+"""Create click commands from records of options.
+
+An option is a field declared with ``settings.setting``. ``_parameter`` creates the click option for it.
+``new_command`` creates a command that calls ``Command.run`` with the record of the typed options. A group
+creates a command only when it is called, so that ``--help`` is immediate.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Mapping
-from inspect import Parameter, Signature
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args, get_origin, get_type_hints
+from typing import Any
 
-import typer
-import typer.main
-from typer.core import TyperCommand, TyperGroup
+import click
 
-from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin._internal.checks import InputError, bad_value
 from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED
-from geodiff_plugin.jobs.memory import CURE, is_out_of_memory
-from geodiff_plugin.jobs.stopping import Terminated, ending_on_sigterm
-from geodiff_plugin.jobs.telling import say
-from geodiff_plugin.options import (
-    OTHERS,
-    OUTPUT,
-    PANELS,
-    Command,
-    OptionRules,
-    check_options,
-    flag_of,
-    rules_of,
-)
+from geodiff_plugin.jobs import MEMORY_HINT, Terminated, ending_on_sigterm, is_out_of_memory, say
+from geodiff_plugin.options import OUTPUT, SECTIONS, Command
+from geodiff_plugin.settings import DEFAULT_SECTION, Setting, check_settings, settings_of
 
-APPEARANCE: dict[str, Any] = {
-    "add_completion": False,
-    "pretty_exceptions_enable": False,
-    "context_settings": {"help_option_names": ["-h", "--help"]},
+#: Settings of every command: ``-h`` is short for ``--help``, and help lines have at most 100 characters.
+CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+#: Placeholders of values in help by type.
+METAVARS = {Path: "PATH", int: "NUMBER", float: "NUMBER"}
+#: Expected single and comma-separated numbers in error messages, by type.
+NUMBERS = {
+    int: ("an integer", "comma-separated integers"),
+    float: ("a number", "comma-separated numbers"),
 }
-#: What help calls the values of an option.
-METAVARS = {bool: "", Path: "PATH", int: "NUMBER", float: "NUMBER"}
+#: Replacement for hyphens in help while lines are wrapped, because ``--view-E`` or a hub id must not be
+#: split.
+NO_BREAK = "\N{NON-BREAKING HYPHEN}"
 
 
-#: How a number of a type is called that is typed wrong.
-NUMBERS = {int: "a whole number", float: "a number"}
+def new_group(help_text: str, commands: Mapping[str, Command], outermost: bool = False) -> click.Group:
+    """Create a group of commands; the outermost group reports errors."""
+    kind = _OutermostGroup if outermost else _Group
+    return kind(help_text, commands)
 
 
-class _Group(TyperGroup):
-    table: Mapping[str, Command]
+class _Group(click.Group):
+    """A group that lists its commands without creating them."""
 
-    def get_help_option(self, ctx: Any) -> Any:
-        """``--help``, which takes no value to be named."""
-        option = super().get_help_option(ctx)
-        vars(option).update(metavar="")
-        return option
+    def __init__(self, help_text: str, table: Mapping[str, Command]) -> None:
+        listed = [click.Command(name, short_help=each.about.split("\n")[0]) for name, each in table.items()]
+        super().__init__(commands=listed, help=help_text, no_args_is_help=True, context_settings=CONTEXT)
+        self.table = table
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that was typed, with its options."""
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names in the order of the table."""
+        return list(self.table)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Create the typed command with its options."""
         name, _, rest = super().resolve_command(ctx, args)
-        return name, None if name is None else _built(name, self.table[name]), rest
+        return name, None if name is None else new_command(name, self.table[name]), rest
 
 
 class _OutermostGroup(_Group):
-    """Bad input is one line and exit code 2, Ctrl-C is exit code 130, SIGTERM 143."""
+    """A group that reports bad input in one line with exit code 2, Ctrl-C with 130 and SIGTERM with 143."""
 
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: click.Context) -> Any:
         """Run the chosen subcommand."""
         try:
             with ending_on_sigterm():
                 return super().invoke(ctx)
         except Terminated:
-            say("geodiff: terminated; the same command resumes")
+            say("geodiff: terminated. Run the same command again to resume.")
             sys.exit(EXIT_TERMINATED)
         except KeyboardInterrupt:
-            say("geodiff: interrupted; the same command resumes")
+            say("geodiff: interrupted. Run the same command again to resume.")
             sys.exit(EXIT_INTERRUPTED)
-        except InputError as error:  # any other is a defect, and keeps its traceback
+        except InputError as error:  # any other error is a bug and keeps its traceback
             say(f"geodiff: {error}")
             sys.exit(EXIT_BAD_INPUT)
         except Exception as error:
             if not is_out_of_memory(error):
                 raise
-            say(f"geodiff: the memory is not enough. {CURE}.")
+            say(f"geodiff: out of memory. {MEMORY_HINT}.")
             sys.exit(EXIT_BAD_INPUT)
 
 
-class _Single(TyperCommand):
-    def get_help_option(self, ctx: Any) -> Any:
-        """``--help``, among the options of output instead of in a group of its own."""
-        option = super().get_help_option(ctx)
-        panels = {getattr(each, "rich_help_panel", None) for each in self.params}
-        vars(option).update(metavar="", rich_help_panel=OUTPUT if OUTPUT in panels else OTHERS)
-        return option
+class _Command(click.Command):
+    """A command whose help has one section per group of options."""
+
+    def __init__(self, name: str, options: Mapping[str, Setting], **more: Any) -> None:
+        parameters = [_parameter(option) for option in options.values()]
+        super().__init__(name, params=parameters, context_settings=CONTEXT, **more)
+        self.options = options
+        self.sections = {name: option.section for name, option in options.items()}
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the words. An option that may lack a value takes the next word only if it is a choice."""
+        bare = {option.flag: option for option in self.options.values() if option.bare}
+        words = [
+            f"{word}={bare[word].bare}" if word in bare and after not in bare[word].choices else word
+            for word, after in zip(args, [*args[1:], ""], strict=False)
+        ]
+        return super().parse_args(ctx, words)
+
+    def get_help(self, ctx: click.Context) -> str:
+        """Return the help text."""
+        return super().get_help(ctx).replace(NO_BREAK, "-")
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write one section per group of options; ``--help`` is listed with the output options."""
+        of_help = OUTPUT if OUTPUT in self.sections.values() else DEFAULT_SECTION
+        rows: dict[str, list[tuple[str, str]]] = {section: [] for section in SECTIONS}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None and isinstance(parameter, click.Option):
+                rows[self.sections.get(str(parameter.name), of_help)].append(record)
+        for section, shown in rows.items():
+            if shown:
+                with formatter.section(section):
+                    formatter.write_dl(shown)
 
 
-def new_group(help_text: str, commands: Mapping[str, Command], outermost: bool = False) -> typer.Typer:
-    """A group of commands by their names; errors are told by the outermost one."""
-    kind = type("Group", (_OutermostGroup if outermost else _Group,), {"table": commands})
-    group = typer.Typer(cls=kind, help=help_text, no_args_is_help=True, **APPEARANCE)
-    for name, command in commands.items():
-        group.command(name, help=command.about)(lambda: None)
-    return group
-
-
-def _built(name: str, command: Command) -> Any:
+def new_command(name: str, command: Command) -> click.Command:
+    """Create a command with its options, or the group that it represents."""
     if command.options is None:
-        return typer.main.get_command(command.run(None))
-    options, kinds = command.options, get_type_hints(command.options)
-    known = _in_order(options)
+        group: click.Group = command.run(None)
+        return group
+    record = command.options
 
     def call(**typed: Any) -> None:
-        values = {
-            field.name: _value(field, rules, typed[field.name], kinds[field.name])
-            for field, rules in known.items()
-        }
-        made = options(**values)
-        check_options(made)
-        command.run(made)
+        options = record(**typed)
+        check_settings(options)
+        command.run(options)
 
-    parameters = [_parameter(field, rules, kinds[field.name]) for field, rules in known.items()]
-    vars(call)["__signature__"] = Signature(parameters)
-    single = typer.Typer(**APPEARANCE)
-    single.command(name, cls=_Single, help=command.about)(call)
-    return typer.main.get_command(single)
+    return _Command(name, settings_of(record), callback=call, help=command.about)
 
 
-def _in_order(options: type) -> dict[dataclasses.Field[Any], OptionRules]:
-    """The options that are declared, with their rules: arguments first, then group by group."""
-    known = {field: rules for field in dataclasses.fields(options) if (rules := rules_of(field)) is not None}
-
-    def place(field: dataclasses.Field[Any]) -> tuple[bool, int]:
-        return not known[field].is_argument, PANELS.index(known[field].panel)
-
-    return {field: known[field] for field in sorted(known, key=place)}
-
-
-def _parameter(field: dataclasses.Field[Any], rules: OptionRules, kind: Any) -> Parameter:
-    """An option or argument of typer for a field of a dataclass of options."""
-    required, default = field.default is dataclasses.MISSING, cast(Any, field.default)
-    about: dict[str, Any] = {
-        "metavar": _metavar(kind) if rules.metavar is None else rules.metavar,
-        "help": rules.help,
-    }
-    if rules.split:
-        if default:  # in the sentence: lines of help break at blanks alone, and it is typed without them
-            listed = "all" if set(default) == set(rules.choices) else ", ".join(map(str, default))
-            about["help"] = f"{rules.help.removesuffix('.')} (default: {listed})."
-        kind, default = str | None, ",".join(map(str, default)) or None
-    elif get_origin(kind) is tuple:
-        kind = list[get_args(kind)[0]]  # type: ignore[misc]
-        kind, default = (kind, default) if required else (kind | None, list(default) or None)
-    elif _number(kind):  # read by _value, which says what was typed
-        kind, default = str | None, default if required or default is None else str(default)
-    if rules.is_argument:
-        typed: Any = typer.Argument(**about)
+def _parameter(option: Setting) -> click.Parameter:
+    """Create the click option or argument for a setting."""
+    required = option.default is MISSING
+    default = _default_text(option)
+    sentence = f"{option.help} [default: {default}]" if default else option.help
+    more: dict[str, Any] = {"help": sentence.replace("-", NO_BREAK), "required": required}
+    more |= {} if required else {"default": option.default}
+    if option.is_argument:
+        shown = (option.metavar or option.flag) + "..." * option.several
+        more |= {"metavar": shown if required else f"[{shown}]", "nargs": -1 if option.several else 1}
+        return click.Argument([option.name], type=_Typed(option), **more)
+    if option.kind is bool:
+        more |= {"is_flag": True}
     else:
-        flags = rules.flags or (flag_of(field),)
-        typed = typer.Option(*flags, **about, rich_help_panel=rules.panel, show_default=not rules.split)
-    default = Parameter.empty if required else default
-    return Parameter(field.name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind, typed], default=default)
+        repeated = option.several and not option.comma_separated
+        more |= {"type": _Typed(option), "metavar": option.metavar, "multiple": repeated}
+    return click.Option([option.name, *(option.flags or (option.flag,))], **more)
 
 
-def _metavar(kind: Any) -> str:
-    """What an option takes, in a word; nothing for one that is switched on."""
-    kinds = {kind, *get_args(kind), *(inner for each in get_args(kind) for inner in get_args(each))}
-    return next((word for name, word in METAVARS.items() if name in kinds), "TEXT")
+def _default_text(option: Setting) -> str:
+    """Return the default as shown in help; empty for none."""
+    if option.default in (None, (), MISSING) or option.kind is bool:
+        return ""
+    if option.several:
+        everything = set(option.default) == set(option.choices)
+        return "all" if everything else ", ".join(map(str, option.default))
+    return str(option.default)
 
 
-def _number(kind: Any) -> Any:
-    """``int`` or ``float``, where a field is one number; else ``None``."""
-    return next((number for number in NUMBERS if number in (kind, *get_args(kind))), None)
+class _Typed(click.ParamType[Any]):
+    """Parser for the typed value of a setting. Bad values raise ``InputError``, as in all checks."""
+
+    def __init__(self, option: Setting) -> None:
+        self.option, self.name = option, METAVARS.get(option.kind, "TEXT")
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parse a typed value; a default is already parsed."""
+        if not isinstance(value, str):
+            return value
+        kind, several = self.option.kind, self.option.comma_separated
+        try:
+            if several:
+                return tuple(kind(part.strip()) for part in value.split(",") if part.strip())
+            return kind(value)
+        except ValueError:
+            hint = "" if several else _hint_for_number(value)
+            bad_value(self.option.flag, NUMBERS[kind][several], repr(value), hint)
 
 
-def _value(field: dataclasses.Field[Any], rules: OptionRules, value: Any, kind: Any) -> Any:
-    """What was typed, as the field has it."""
-    if rules.split:
-        parts = [part.strip() for part in (value or "").split(",") if part.strip()]
-        if get_args(kind)[0] is int and not all(part.isdecimal() for part in parts):
-            bad_value(flag_of(field), "whole numbers, comma-separated", repr(value))
-        return tuple(get_args(kind)[0](part) for part in parts)
-    if get_origin(kind) is tuple:
-        return tuple(value or ())
-    number = _number(kind)
-    if number is None or value is None:
-        return value
-    try:
-        return number(value)
-    except ValueError:
-        bad_value(flag_of(field), NUMBERS[number], repr(value), _cure_of_number(value))
-
-
-def _cure_of_number(typed: str) -> str:
-    """What to type instead of a decimal comma, or of a number with its unit."""
+def _hint_for_number(typed: str) -> str:
+    """Return a hint for a decimal comma or a number with a unit."""
     if "," in typed:
-        return "Decimals follow a point: 0.12."
-    return "Give the number alone; --help names its unit." if typed[:1].isdigit() else ""
+        return "Use a decimal point: 0.12."
+    return "Give only the number; --help states its unit." if typed[:1].isdigit() else ""

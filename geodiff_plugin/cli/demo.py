@@ -1,4 +1,4 @@
-"""On the bundled pairs: ``geodiff demo``, and ``geodiff bench``, what guidance costs."""
+"""Implement ``geodiff demo`` and ``geodiff bench``, which run on the bundled pairs."""
 
 from __future__ import annotations
 
@@ -19,114 +19,126 @@ import numpy as np
 import torch
 from PIL import Image
 
-from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, example_name, read_demo_pair
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.formats import atomic_path
-from geodiff_plugin.formats.out import OutFolder
-from geodiff_plugin.jobs.many import depth_pairs
-from geodiff_plugin.jobs.options import DepthOptions, start_pair
-from geodiff_plugin.jobs.pair import depth_pair
-from geodiff_plugin.jobs.pairs import start_many
-from geodiff_plugin.jobs.prior import load_guided_prior, prior_of_options
-from geodiff_plugin.jobs.report import single_map, summary_line
-from geodiff_plugin.jobs.telling import collected_warnings, say, silent
+from geodiff_plugin.formats import OutFolder, atomic_path
+from geodiff_plugin.jobs import (
+    DepthOptions,
+    collected_warnings,
+    depth_pair,
+    depth_pairs,
+    load_guided_prior,
+    prior_of_options,
+    say,
+    silent,
+    single_map,
+    start_many,
+    start_pair,
+    summary_line,
+)
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
 from geodiff_plugin.runtime.guided_call import count_guided_steps, enable_geometry_guidance
 from geodiff_plugin.runtime.machine import pick_device, timed
 
 CELL_WIDTH = 360
 COMPARISON = "comparison.png"
-#: Calls of which the fastest counts.
+#: Number of timed calls, of which the fastest counts.
 CALLS = 3
-#: Pairs of the folder whose throughput is measured.
+#: Number of pairs in the folder whose throughput is measured.
 PAIRS = 4
 
 
 def run_demo(options: DepthOptions, out: OutFolder) -> None:
-    """Write what ``geodiff depth`` writes and ``comparison.png``, and print how far it is from the truth."""
-    tell = silent if options.quiet else say
+    """Write the output of ``geodiff depth`` and ``comparison.png``, and print errors against ground truth."""
+    notify = silent if options.quiet else say
     with collected_warnings():
         pipe = prior_of_options(options, pick_device(options.device), None if options.quiet else say)
-        result = depth_pair(options, pipe, folder=out, tell=tell, progress=not options.quiet)
+        result = depth_pair(options, pipe, folder=out, notify=notify, progress=not options.quiet)
     pair = read_demo_pair()
     plain = pipe(pair.left, generator=torch.Generator("cpu").manual_seed(options.seed))
     aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid, pipe.config.prediction_type)
     guided_m = single_map(result.run.output.prediction)
     table = new_table(("", "AbsRel", "delta1", "RMSE, m"))
-    rows = {"prior, aligned to the truth": aligned_m, "guided, metric as it comes": guided_m}
+    rows = {"prior, aligned to ground truth": aligned_m, "guided (metric, no alignment)": guided_m}
     for name, depth_m in rows.items():
         scores = evaluate_depth(depth_m, pair.depth_m, pair.valid)
         table.add_row(name, *(f"{scores[metric]:.3f}" for metric in ("abs_rel", "delta1", "rmse")))
     show(table)
     near, far = depth_range(pair.depth_m)
     maps = [colour_depth(depth_m, near=near, far=far) for depth_m in (aligned_m, guided_m, pair.depth_m)]
-    titles = ["left image", "prior, aligned to the truth", "guided", f"truth, {near:.1f} m to {far:.1f} m"]
-    _write_comparison(out.path, [pair.left, *maps], titles)
+    titles = ["left image", "prior, aligned to ground truth", "guided", "ground truth"]
+    _write_comparison(out.path, [pair.left, *maps], titles, [(near, far)])
     print(summary_line(result.report, f"{out.path}/"))
-    print(f"Open {out.path / COMPARISON} first: prior, guided depth and truth side by side.")
+    print(f"Open {out.path / COMPARISON} first: prior, guided depth and ground truth side by side.")
 
 
 def _write_comparison(
-    folder: Path, pictures: Sequence[np.ndarray], titles: Sequence[str], columns: int | None = None
+    folder: Path,
+    images: Sequence[np.ndarray],
+    titles: Sequence[str],
+    depth_ranges: Sequence[tuple[float, float]],
+    columns: int | None = None,
 ) -> None:
+    """Write images next to each other, each row with the colour bar of its depths."""
     try:
         with atomic_path(folder / COMPARISON) as temporary:
-            sheet = grid(pictures, titles, columns=columns, cell_width=CELL_WIDTH)
+            sheet = grid(images, titles, columns=columns, cell_width=CELL_WIDTH, depth_ranges=depth_ranges)
             sheet.save(temporary)
-    except OSError as error:  # the results themselves are safe
+    except OSError as error:  # the results are already written
         say(f"geodiff: {COMPARISON} could not be written ({error.strerror or error}).")
 
 
 def run_real_demo(pairs: Sequence[DepthOptions], out: Path) -> None:
-    """Write what ``geodiff depth`` writes of every pair into ``out/NAME``, and ``comparison.png`` of all."""
-    first, cells, titles = pairs[0], list[np.ndarray](), list[str]()
-    tell = silent if first.quiet else say
+    """Write the output of ``geodiff depth`` for every pair to ``out/NAME``, and one ``comparison.png``."""
+    first, cells, titles, ranges = pairs[0], list[np.ndarray](), list[str](), list[tuple[float, float]]()
+    notify = silent if first.quiet else say
     with collected_warnings():
         pipe = prior_of_options(first, pick_device(first.device), None if first.quiet else say)
         for pair in pairs:
-            name = pair.left.parent.name
-            options = replace(pair, out=out / name)
+            name = example_name(pair.left.parent)
+            options = replace(pair, out=out / name.lower())
             with start_pair(options) as folder:
-                result = depth_pair(options, pipe, folder=folder, tell=tell, progress=not options.quiet)
+                result = depth_pair(options, pipe, folder=folder, notify=notify, progress=not options.quiet)
             print(summary_line(result.report, f"{folder.path}/"))
             depth_m = single_map(result.run.output.prediction)
             cells += [result.run.inputs.left, colour_depth(depth_m)]
-            titles += [name, "{:.1f} m to {:.1f} m".format(*depth_range(depth_m))]
-    _write_comparison(out, cells, titles, columns=2)
-    print(f"Open {out / COMPARISON} first: every left image beside its depth.")
+            ranges.append(depth_range(depth_m))
+            titles += [name, "depth"]
+    _write_comparison(out, cells, titles, ranges, columns=2)
+    print(f"Open {out / COMPARISON} first: each left image next to its depth.")
 
 
 def run_bench(options: Any) -> None:
-    """Print seconds of a plain and of a guided call, pairs a second, and where the time of a command goes."""
+    """Print the seconds of a plain and a guided call, the throughput, and the stages of a command."""
     place, pair = pick_device(options.device), read_demo_pair()
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    pipe = load_guided_prior(options.prior, place, options.space)
-    enable_geometry_guidance(pipe, graphs=options.graphs, kernels=not options.no_kernels)
+    pipe = load_guided_prior(options.prior, place, options.space, options.dtype)
+    enable_geometry_guidance(pipe, cuda_graphs=options.cuda_graphs, kernels=not options.no_triton)
     guidance = GeometryGuidance(pair.right, (pair.rig.K_left, pair.rig.K_right), pair.rig.E)
     count, _ = count_guided_steps(pipe, guidance, options.steps)
     generator = torch.Generator("cpu").manual_seed(options.seed)
-    table, fastest = new_table(("", "seconds", "time x")), list[float]()
+    table, fastest = new_table(("", "seconds", "ratio")), list[float]()
     for name, given in (("plain", None), ("guided", guidance)):
         call = partial(pipe, pair.left, guidance=given, num_inference_steps=count, generator=generator)
         fastest.append(min(timed(call, place) for _ in range(CALLS)))
         table.add_row(name, f"{fastest[-1]:.2f}", f"{fastest[-1] / fastest[0]:.2f}")
     title = f"prior {options.prior}, {count} steps, default guidance; {where}; demo pair"
-    show(title, table, _pairs_a_second(options, pipe, count, place), _command_seconds(options, place))
+    show(title, table, _throughput(options, pipe, count, place), _command_timings(options, place))
 
 
-def _write_plainly(pipe: Any, steps: int, folder: Path) -> None:
-    """Plain calls on every picture of a folder, whose depth is written and removed again."""
+def _write_plain(pipe: Any, steps: int, folder: Path) -> None:
+    """Make plain calls on every image of a folder, and write and remove their depth."""
     for path in sorted(folder.iterdir()):
-        with Image.open(path) as picture:
-            depth = pipe(picture.convert("RGB"), num_inference_steps=steps).prediction
+        with Image.open(path) as image:
+            depth = pipe(image.convert("RGB"), num_inference_steps=steps).prediction
         np.save(path.with_suffix(".npy"), depth)
         path.with_suffix(".npy").unlink()
 
 
-def _pairs_a_second(options: Any, pipe: Any, steps: int, place: torch.device) -> str:
-    """Throughput of a folder of demo pairs, read and written: guided by the command, and plain."""
+def _throughput(options: Any, pipe: Any, steps: int, place: torch.device) -> str:
+    """Measure the throughput on a folder of demo pairs, including file access, guided and plain."""
     with tempfile.TemporaryDirectory() as parent:
         folder = Path(parent)
         for side, number in product(("left", "right"), range(PAIRS)):
@@ -145,26 +157,26 @@ def _pairs_a_second(options: Any, pipe: Any, steps: int, place: torch.device) ->
         )
         refs = start_many(many)
         guided = PAIRS / timed(lambda: depth_pairs(many, refs, pipe=pipe), place)
-        plain = PAIRS / timed(lambda: _write_plainly(pipe, steps, folder / "left"), place)
-    of_plain = f"{guided / plain:.2f} of plain's"
-    return f"pairs a second of a folder: guided {guided:.2f}, plain {plain:.2f} ({of_plain})"
+        plain = PAIRS / timed(lambda: _write_plain(pipe, steps, folder / "left"), place)
+    ratio = f"ratio {guided / plain:.2f}"
+    return f"throughput on a folder: guided {guided:.2f} pairs/s, plain {plain:.2f} pairs/s ({ratio})"
 
 
-def _command_seconds(options: Any, place: torch.device) -> str:
-    """Where the time of ``geodiff depth`` goes, in a process of its own."""
+def _command_timings(options: Any, place: torch.device) -> str:
+    """Run ``geodiff depth`` in a separate process and return a line with the seconds of its stages."""
     left, right, calib = (str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png", "calib.txt"))
     with tempfile.TemporaryDirectory() as folder:
         flags = ["--calib", calib, "--device", str(place), "--json", "--quiet", "--out", f"{folder}/out"]
         for name in ("prior", "space", "steps", "seed"):
             value = getattr(options, name)
             flags += [] if value is None else [f"--{name}", str(value)]
-        flags += ["--graphs"] if options.graphs else []
-        flags += ["--no-kernels"] if options.no_kernels else []
-        words = [sys.executable, "-m", "geodiff_plugin", "depth", left, right, *flags]
+        flags += ["--cuda-graphs"] if options.cuda_graphs else []
+        flags += ["--no-triton"] if options.no_triton else []
+        command = [sys.executable, "-m", "geodiff_plugin", "depth", left, right, *flags]
         started = time.perf_counter()
-        answer = subprocess.run(words, check=True, capture_output=True, text=True)
-        whole = time.perf_counter() - started
-    stages: dict[str, float] = json.loads(answer.stdout)["seconds"]
-    stages["python"] = whole - sum(stages.values())  # what lies around them
-    told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
-    return f"geodiff depth: {sum(stages.values()):.1f} s ({told})"
+        process = subprocess.run(command, check=True, capture_output=True, text=True)
+        total = time.perf_counter() - started
+    stages: dict[str, float] = json.loads(process.stdout)["seconds"]
+    stages["python"] = total - sum(stages.values())  # the time outside all stages
+    reported = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
+    return f"geodiff depth: {sum(stages.values()):.1f} s ({reported})"

@@ -1,4 +1,4 @@
-"""The ``geodiff eval`` commands (S5, experiments): built from ``evaluation.options.COMMANDS``."""
+"""Build the ``geodiff eval`` commands (S5, experiments) from ``evaluation.options.COMMANDS``."""
 
 from __future__ import annotations
 
@@ -10,48 +10,46 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
+import click
 
 from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, new_table, print_lines, show
 from geodiff_plugin.evaluation.options import COMMANDS
-from geodiff_plugin.formats.out import check_out
-from geodiff_plugin.jobs.telling import say
-from geodiff_plugin.options import Command, declare
+from geodiff_plugin.findings import some_names
+from geodiff_plugin.formats import check_out
+from geodiff_plugin.jobs import say
+from geodiff_plugin.options import Command
+from geodiff_plugin.settings import setting
 
 if TYPE_CHECKING:
     from geodiff_plugin.evaluation.experiment import Page
 
-#: Broken samples that are named.
-MOST_NAMES = 9
-
 
 @dataclass(frozen=True, kw_only=True)
 class _ListOptions:
-    data: Path | None = declare(None, "Folder to look for data sets in.")
+    data: Path | None = setting(None, "Folder with data sets.")
 
 
 def run_and_show(measure: Callable[[Any], Any], options: Any) -> None:
-    """Measure, and print the page or the path of the figure unless the options say quiet.
+    """Run an evaluation and print the page or the path of the figure, unless ``quiet`` is set.
 
-    Samples that were left out are said at the end, with ``EXIT_SOME_FAILED``.
+    Skipped samples are reported at the end and lead to exit code ``EXIT_SOME_FAILED``.
     """
     check_out(options.out)
     result = measure(options)
     if isinstance(result, Path) and not options.quiet:
-        typer.echo(result)
+        click.echo(result)
     elif result is not None and not options.quiet:
         _print_page(result)
-        typer.echo(f"-> {options.out}/")
+        click.echo(f"-> {options.out}/")
     if broken := getattr(result, "broken", ()):
-        some = ", ".join(broken[:MOST_NAMES]) + ", ..." * (len(broken) > MOST_NAMES)
         count = "1 broken sample was" if len(broken) == 1 else f"{len(broken)} broken samples were"
-        say(f"geodiff: {count} left out: {some}. The same command tries them again.")
+        say(f"geodiff: {count} skipped: {some_names(broken)}. Run the same command again to retry.")
         sys.exit(EXIT_SOME_FAILED)
 
 
 def _print_page(page: Page) -> None:
-    """Title, how the page was made, its remarks and its tables."""
+    """Print the title, origin, remarks and tables of a page."""
     from rich.text import Text
 
     origin = (Text(page.facts["command"], style="dim"), Text(page.origin(), style="dim"))
@@ -76,14 +74,14 @@ def _list(options: _ListOptions) -> None:
         rows.append((name, f"{there}\n{dataset.obtain}"))
     rows += [("", ""), *((name, method.summary) for name, method in METHODS.items())]
     for name, family in FAMILIES.items():
-        about = getattr(family, "func", family).__doc__  # of a partial the function's
+        about = getattr(family, "func", family).__doc__  # the docstring of a partial's function
         summary = re.split(r"[.;]", about or " ", maxsplit=1)[0]
         rows.append((f"{name}:...", f"{summary[0].lower()}{summary[1:]}"))
-    rows.append(("METHOD@PRIOR", "a method that uses a prior, with another one than --prior"))
-    rows.append(("METHOD#SEED", "the same with another seed than --seed; METHOD@PRIOR#SEED for both"))
+    rows.append(("METHOD@PRIOR", "a method with another prior than --prior"))
+    rows.append(("METHOD#SEED", "a method with another seed than --seed; METHOD@PRIOR#SEED for both"))
     print_lines(rows)
 
 
-LIST = Command(_ListOptions, _list, "List the data sets and the methods.")
+LIST = Command(_ListOptions, _list, "List data sets and methods.")
 _COMMANDS = {name: each._replace(run=partial(run_and_show, each.run)) for name, each in COMMANDS.items()}
 eval_app = new_group("Evaluate this package and other methods on data sets.", _COMMANDS | {"list": LIST})

@@ -1,4 +1,4 @@
-"""What the command answers on stdout: tables that ``rich`` draws, and exit codes."""
+"""Print to stdout, draw tables with ``rich``, and define exit codes."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # drawn by few commands
+if TYPE_CHECKING:  # only some commands need rich
     from rich.console import RenderableType
     from rich.table import Table
 
-#: Exit status of a command whose input is refused, as of one with a wrong option.
+#: Exit code for invalid input or options.
 EXIT_BAD_INPUT = 2
-#: Of a run some of whose pairs or frames failed, while the others are written.
+#: Exit code of a run in which some pairs or frames failed and the others were written.
 EXIT_SOME_FAILED = 4
-#: Of an interrupted run: 128 and the number of the signal, as shells have it.
+#: Exit code of an interrupted run, 128 plus the number of SIGINT.
 EXIT_INTERRUPTED = 130
-#: Likewise of a run that was asked to end.
+#: Exit code of a terminated run, 128 plus the number of SIGTERM.
 EXIT_TERMINATED = 143
-#: Characters a line may have where nobody's terminal bounds it.
+#: Line width for files and pipes, in characters.
 UNBOUNDED = 10_000
 
 
 def show(*shown: RenderableType) -> None:
-    """Print on the present standard output, text as it is; lines of a file or a pipe do not end in blanks."""
+    """Print to the current stdout without markup; trailing blanks are removed for files and pipes."""
     from rich.console import Console
 
     console = Console(markup=False, highlight=False, emoji=False)
@@ -39,12 +39,12 @@ def show(*shown: RenderableType) -> None:
 
 
 def new_table(header: Sequence[str], title: str = "") -> Table:
-    """A table whose first column is text and whose others are numbers; no title where that is empty."""
+    """Create a table with a text column followed by number columns; an empty title is omitted."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    heading = Text(title, style="bold") if title else None  # of a str the markup would be read
+    heading = Text(title, style="bold") if title else None  # rich would parse markup in a str
     table = Table(box=box.SIMPLE_HEAD, title=heading, title_justify="left")
     for index, name in enumerate(header):
         table.add_column(name, justify="right" if index else "left", overflow="fold")
@@ -52,7 +52,7 @@ def new_table(header: Sequence[str], title: str = "") -> Table:
 
 
 def print_lines(rows: Sequence[tuple[str, str]]) -> None:
-    """Print names and values in two columns, with values wrapped inside their own."""
+    """Print names and values in two columns, wrapping long values within their column."""
     from rich.table import Table
 
     table = Table.grid(padding=(0, 2, 0, 0))

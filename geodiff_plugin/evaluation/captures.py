@@ -1,4 +1,4 @@
-"""Frames of a moving camera: ``geodiff eval capture``."""
+"""Implements ``geodiff eval capture``: frames of a moving camera."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from geodiff_plugin.evaluation.experiment import Experiment, Page, run_experimen
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import CAPTURE_ROWS, CaptureEvalOptions, CaptureRow
 from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, table_of_groups
-from geodiff_plugin.jobs.journal import Item, Record, fingerprint
+from geodiff_plugin.jobs import Item, Record, fingerprint
 from geodiff_plugin.types import DepthFrame
 
-#: A point whose depth in the next frame differs by more than this share is hidden there, and counts not.
-HIDDEN_SHARE = 0.3
-#: Distance within which a point of a cloud counts as right, metres (Tanks and Temples' order for rooms).
+#: Relative depth difference in the next frame above which a point is occluded and ignored.
+OCCLUDED_FRACTION = 0.3
+#: Maximum distance in metres of a correct point in a cloud (order of Tanks and Temples for rooms).
 RIGHT_M = 0.05
-#: Edge of the cells in which one point of a cloud is kept, metres.
+#: Side in metres of the cells in which one point of a cloud is kept.
 CELL_M = 0.02
 
 _CAPTURE_COLUMNS: dict[str, CellOf] = {
@@ -43,23 +43,23 @@ _CAPTURE_COLUMNS: dict[str, CellOf] = {
     "TAE %": mean_of("tae", 2),
 }
 CAPTURE_NOTE = (
-    "Poses as the tracker gave them, refined by the views of each frame alone, and solved over the whole "
-    "capture. AbsRel in metres, without alignment, mean and worst over the frames; scaled: each frame by its "
-    "median. Scale: median of depth over truth. Agreed: AbsRel after the frames of the table were checked "
-    "against each other. F: of the fused cloud beside that of the true depth under the same poses. TAE: of "
-    "frames one after the other, as chosen."
+    "Poses are the tracker's, refined per frame from its own views, or solved over the whole capture. "
+    "AbsRel in metres without alignment, mean and worst over the frames; scaled: each frame scaled by its "
+    "median. Scale: median of depth over ground truth. Agreed: AbsRel after the consistency check between "
+    "frames. F: F-score of the fused cloud against the cloud from ground-truth depth under the same poses. "
+    "TAE: temporal alignment error between consecutive frames of the selection."
 )
 
 
-#: Fewest pixels of a frame that another one has to see for their difference to count.
-FEWEST_SEEN = 100
+#: Minimum number of pixels of a frame that another one must observe for their difference to count.
+MIN_SEEN_PIXELS = 100
 
 
-def f_score(points: np.ndarray, truth: np.ndarray) -> float:
-    """F-score of points ``(N, 3)``: within ``RIGHT_M`` of the truth's, and back (Tanks and Temples, S4)."""
-    if not len(points) or not len(truth):
+def f_score(points: np.ndarray, ground_truth: np.ndarray) -> float:
+    """F-score of points ``(N, 3)`` with tolerance ``RIGHT_M`` (Tanks and Temples, S4)."""
+    if not len(points) or not len(ground_truth):
         return 0.0
-    clouds = ((truth, points), (points, truth))
+    clouds = ((ground_truth, points), (points, ground_truth))
     distances = (cKDTree(to).query(of, distance_upper_bound=RIGHT_M)[0] for to, of in clouds)
     accuracy, complete = (float((near < np.inf).mean()) for near in distances)
     return 2 * accuracy * complete / max(accuracy + complete, 1e-12)
@@ -72,14 +72,14 @@ def temporal_error(frames: Sequence[DepthFrame]) -> float:
         for frame, other in (pair, pair[::-1]):
             row, column, z, inside = seen_in(frame, other)
             off = np.abs(z[inside] / other.depth[row, column][inside] - 1)
-            off = off[off < HIDDEN_SHARE]
-            if len(off) >= FEWEST_SEEN:
+            off = off[off < OCCLUDED_FRACTION]
+            if len(off) >= MIN_SEEN_PIXELS:
                 errors.append(off.mean())
     return 100 * float(np.mean(errors)) if errors else float("nan")
 
 
 def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
-    """Measure every row and number of neighbours, and write the page; errors as ``run_experiment``."""
+    """Measure every row and number of neighbours, and write the page; errors as in ``run_experiment``."""
     priors, settings, cells, titles = PriorCache(), options.settings, list[Item](), dict[str, str]()
     for data in options.data:
         captures = {poses: Capture.open(data) for poses in ("given", "refined")}
@@ -88,7 +88,7 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
             at = ((np.arange(options.count) + 0.5) * len(names) / options.count).astype(int)
             names = [names[i] for i in np.unique(at)]
         for frame in names:
-            captures["given"].measured_depth(frame)  # raises where a frame has none
+            captures["given"].measured_depth(frame)  # raises if a frame has none
         titles[str(data)] = f"{data.name}, {len(names)} frames"
         pipe = priors.get(settings)
         how = (str(data.resolve()), names, options.prior, priors.fingerprint(settings), options.steps)
@@ -119,18 +119,18 @@ def _measure_frames(
     names: Sequence[str],
     options: CaptureEvalOptions,
 ) -> Record:
-    """Depth of every frame by one row and number of neighbours, and its scores."""
-    solved = capture.solve(row.poses)
+    """Return depth scores of all frames for one row and number of neighbours."""
+    capture.solve(row.poses)
     call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}
     frames, true_frames, known = [], [], []
     for name in names:
         with torch.no_grad():
-            out = capture.depth(pipe, name, count, seed=options.seed, knobs={"pose": row.pose}, **call)
-        i, depth = capture.names.index(name), np.asarray(out.prediction)[0, ..., 0]
+            out = capture.depth(pipe, name, count, seed=options.seed, parameters={"pose": row.pose}, **call)
+        camera, depth = capture.camera(name), np.asarray(out.prediction)[0, ..., 0]
         confidence = np.ones_like(depth) if out.confidence is None else np.asarray(out.confidence)[0, ..., 0]
-        truth, valid = capture.measured_depth(name)
-        frames.append(DepthFrame(name, depth, confidence, solved.K[i], solved.E[i]))
-        true_frames.append(DepthFrame(name, truth, np.ones_like(depth), solved.K[i], solved.E[i]))
+        ground_truth, valid = capture.measured_depth(name)
+        frames.append(DepthFrame(name, depth, confidence, camera))
+        true_frames.append(DepthFrame(name, ground_truth, np.ones_like(depth), camera))
         known.append(valid)
     together = [agreed(frame, [other for other in frames if other is not frame]) for frame in frames]
 
@@ -144,27 +144,27 @@ def _measure_frames(
 
 
 def _thin(frames: Sequence[DepthFrame], known: Sequence[np.ndarray]) -> np.ndarray:
-    points = np.concatenate([frame.world(mask) for frame, mask in zip(frames, known, strict=True)])
+    points = np.concatenate([frame.world()[mask] for frame, mask in zip(frames, known, strict=True)])
     return points[np.unique(np.floor(points / CELL_M).astype(np.int64), axis=0, return_index=True)[1]]
 
 
 def _of_points(capture: Capture, names: Sequence[str]) -> Record:
-    """The solve's own sparse points, at their pixels."""
+    """Return the solve's sparse points at their pixels."""
     solved, scores = capture.solve(), []
     for name in names:
         i = capture.names.index(name)
-        truth, known = capture.measured_depth(name)
+        ground_truth, known = capture.measured_depth(name)
         (px, seen), T = solved.seen[i], np.linalg.inv(solved.E[i])
         z = solved.points[seen] @ T[2, :3] + T[2, 3]
-        u, v = np.rint(px).astype(int).T.clip(0, np.array(truth.shape[::-1])[:, None] - 1)
-        there = known[v, u] & (z > 0)
-        if there.any():
-            scores.append(_scores(z[None], truth[v, u][None], there[None]))
+        u, v = np.rint(px).astype(int).T.clip(0, np.array(ground_truth.shape[::-1])[:, None] - 1)
+        scored = known[v, u] & (z > 0)
+        if scored.any():
+            scores.append(_scores(z[None], ground_truth[v, u][None], scored[None]))
     return _means(scores) if scores else {}
 
 
-def _scores(depth: np.ndarray, truth: np.ndarray, known: np.ndarray) -> dict[str, float]:
-    scores, ratio = evaluate_depth(depth, truth, known), depth[known] / truth[known]
+def _scores(depth: np.ndarray, ground_truth: np.ndarray, known: np.ndarray) -> dict[str, float]:
+    scores, ratio = evaluate_depth(depth, ground_truth, known), depth[known] / ground_truth[known]
     scale = float(np.median(ratio))
     scaled = {"scaled": float(np.mean(np.abs(ratio / scale - 1))), "scale": scale}
     within = {"delta_103": float((np.maximum(ratio, 1 / ratio) < 1.03).mean()), "delta_125": scores["delta1"]}

@@ -1,4 +1,4 @@
-"""An experiment: cells (samples x methods x settings), each measured and scored once, and its page of tables.
+"""An experiment: cells (samples x methods x settings), measured and scored once, and its page of tables.
 
 The cells of every command are the items of one ``Runner``: all resume, and processes may share them.
 """
@@ -26,8 +26,8 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.capture.agreement import seen_in
+from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin.cameras import Camera, PosedCamera
 from geodiff_plugin.evaluation import metrics
 from geodiff_plugin.evaluation.baselines import (
     Method,
@@ -42,31 +42,28 @@ from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity
 from geodiff_plugin.evaluation.options import command_line
 from geodiff_plugin.evaluation.tables import Table, label_of
-from geodiff_plugin.formats import write_depth_npy
-from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import write_text
-from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, fingerprint
-from geodiff_plugin.jobs.runner import Runner
+from geodiff_plugin.formats import file_digest, write_depth_npy, write_text
+from geodiff_plugin.jobs import BROKEN, Item, Journal, Record, Runner, Shard, fingerprint
 from geodiff_plugin.matching import match_volume
+from geodiff_plugin.matching.matches import RELIABLE
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
 from geodiff_plugin.runtime.machine import PeakMemory, versions
-from geodiff_plugin.types import DepthFrame
 
-#: Journal of methods on samples, which several commands share.
+#: Journal of methods on samples, shared by several commands.
 RECORDS_NAME = "samples.jsonl"
 Tables = Callable[[list[Record]], Sequence[Table]]
-#: Material classes that Booster's authors call transparent or mirror when they score depth.
+#: Material classes that Booster's authors count as transparent or mirror when scoring depth.
 TOM_CLASSES = (2, 3)
-#: Share of pixels with truth from which on its edges are there to be measured.
+#: Number of points of the risk-coverage curves in records.
+RISK_STEPS = 20
+#: Minimum fraction of pixels with ground truth for edge metrics.
 DENSE = 0.5
-#: Confidence from which on a match of our plane sweep counts as one.
-RELIABLE_MATCH = 0.5
 
 Scores = dict[str, float | None]
 
 
 def run_facts(command: str, options: Any) -> dict[str, Any]:
-    """Command line, date, versions and machine of a run."""
+    """Return command line, date, versions and machine of a run."""
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads"
     machine += f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
     line = {"command": command_line(command, options), "date": date.today().isoformat()}
@@ -75,16 +72,16 @@ def run_facts(command: str, options: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Page:
-    """What a command measured: ``run_facts``, sentences above the tables, and the tables in reading order."""
+    """Result of a command: ``run_facts``, remarks above the tables, and the tables in reading order."""
 
     title: str
     facts: dict[str, Any]
     tables: tuple[Table, ...]
     remarks: tuple[str, ...]
-    broken: tuple[str, ...] = ()  # samples that are left out
+    broken: tuple[str, ...] = ()  # skipped samples
 
     def origin(self) -> str:
-        """One line: date, versions, machine."""
+        """Return date, versions and machine in one line."""
         named = ", ".join(f"{name} {value}" for name, value in self.facts["versions"].items())
         return f"{self.facts['date']}; {named}; {self.facts['machine']}."
 
@@ -92,7 +89,7 @@ class Page:
 def write_page(
     command: str, options: Any, title: str, tables: Iterable[Table], remarks: Sequence[str]
 ) -> Page:
-    """Write the tables that have rows into ``--out``: Markdown, which ``--results`` gets too, LaTeX, JSON."""
+    """Write non-empty tables to ``--out`` as Markdown (also to ``--results``), LaTeX and JSON."""
     shown = tuple(table for table in tables if table.rows)
     page = Page(title, run_facts(command, options), shown, tuple(remarks))
     head = [f"# {title}", f"    {page.facts['command']}", page.origin(), *remarks]
@@ -108,17 +105,17 @@ def write_page(
 
 @dataclass(frozen=True)
 class Experiment:
-    """What a command measures, and how its page shows the records of that."""
+    """Measurements of a command, and the presentation of their records on its page."""
 
     title: str
     cells: Sequence[Item]
     tables: Tables
-    remarks: Callable[[list[Record]], Sequence[str]] = lambda records: ()  # sentences above the tables
-    journal: str = ""  # file of the records in ``--out``, by default of the command's name
+    remarks: Callable[[list[Record]], Sequence[str]] = lambda records: ()  # remarks above the tables
+    journal: str = ""  # file of the records in ``--out`` (default: the command's name)
 
 
 def run_experiment(command: str, options: Any, experiment: Experiment) -> Page | None:
-    """Measure the cells without a record, and write the page; ``None`` while other shards have cells left."""
+    """Measure cells without a record, and write the page; ``None`` while other shards have cells left."""
     records = measure_cells(experiment.cells, options, experiment.journal or f"{command}.jsonl")
     if records is None:
         return None
@@ -129,9 +126,9 @@ def run_experiment(command: str, options: Any, experiment: Experiment) -> Page |
 
 
 def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NAME) -> list[Record] | None:
-    """The records of cells, in order, those of one key measured once; ``None`` as ``run_experiment``.
+    """Return the records of cells, in order, measuring each key once; ``None`` as in ``run_experiment``.
 
-    Of several processes (``RANK``, ``WORLD_SIZE``) each takes every so many-th sample.
+    With several processes (``RANK``, ``WORLD_SIZE``) each takes every N-th sample.
     """
     shard, every = Shard.of(None), list({cell.key: cell for cell in cells}.values())
     samples = dict.fromkeys(_sample_of(cell) for cell in every)
@@ -142,7 +139,7 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
             [cell for cell in every if _sample_of(cell) in mine],
             records,
             noun="cell",
-            survives=() if getattr(options, "stop_on_broken", True) else (OSError, ValueError),
+            is_recoverable=() if getattr(options, "stop_on_broken", True) else (OSError, ValueError),
             progress=not options.quiet,
             whole=_has_map,
         )
@@ -154,31 +151,32 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
 
 
 def _sample_of(cell: Item) -> str:
-    """What cells have in common that one process should measure, as it is read once for all of them."""
+    """Return the key shared by cells of one sample, which one process measures so that it is read once."""
     return str(cell.head.get("sample", cell.key))
 
 
 def out_of_view(sample: StereoSample) -> np.ndarray:
-    """``(H, W)`` bool: pixels with truth that the true depth puts behind or beside the right image."""
-    left = DepthFrame("left", sample.depth_m, sample.valid, sample.K_left, np.eye(4))
-    right = DepthFrame("right", sample.right[..., 0], sample.right[..., 0], sample.K_right, sample.E_scored)
-    return sample.valid & ~seen_in(left, right).inside
+    """``(H, W)`` bool: pixels with ground truth that project behind the right camera or outside its image."""
+    height, width = sample.right.shape[:2]
+    right = PosedCamera(sample.K_right, (width, height), E=sample.E_scored)
+    px, _ = right.project(right.from_world(Camera(sample.K_left).unproject(sample.depth_m)))
+    return sample.valid & ~right.contains(px)
 
 
 @lru_cache(maxsize=1)
 def matched(sample: StereoSample) -> np.ndarray | None:
-    """``(H, W)`` bool: where our sweep, on the CPU and by the true poses, has a reliable match."""
+    """``(H, W)`` bool: reliable matches of the package's sweep, on the CPU with ground-truth poses."""
     try:
         volume = sweep(replace(sample, E=sample.E_scored), "cpu")
     except ValueError:
         return None
     matches = match_volume(volume)
-    reliable = (matches.confidence >= RELIABLE_MATCH).float()
+    reliable = (matches.confidence >= RELIABLE).float()
     return F.interpolate(reliable[None], sample.depth_m.shape, mode="nearest-exact")[0, 0].numpy() > 0
 
 
 def regions(sample: StereoSample) -> dict[str, np.ndarray]:
-    """Masks by which AbsRel is split, ``(H, W)`` bool, within ``sample.valid``, as far as they are known."""
+    """Return region masks for AbsRel, ``(H, W)`` bool, within ``sample.valid``, as far as known."""
     masks = {"out_of_view": out_of_view(sample)}
     by_match = matched(sample)
     if by_match is not None:
@@ -195,24 +193,22 @@ def regions(sample: StereoSample) -> dict[str, np.ndarray]:
 
 
 def _plain(scores: Mapping[str, float | None]) -> Scores:
-    """Rounded to 7 digits; NaN becomes ``None``, which JSON has a word for."""
+    """Round to 7 digits; replace NaN by ``None`` for JSON."""
     return {k: None if v is None or math.isnan(v) else float(f"{v:.7g}") for k, v in scores.items()}
 
 
 def _positive(depth_m: np.ndarray | None) -> np.ndarray:
-    """The map with NaN where it is not a positive number."""
-    assert depth_m is not None  # a prediction has metres where it has no relative map
+    """Replace values that are not positive by NaN."""
+    assert depth_m is not None  # a prediction has metres or a relative map
     return np.where(metrics.answered(depth_m), depth_m, np.nan)
 
 
 def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Scores]:
-    """``DISPARITY_METRICS`` of a rectified sample, of ``all`` pixels with truth and by region."""
-    cameras, valid = (sample.K_left, sample.K_right, sample.E_scored), sample.valid
-    true_px = depth_to_disparity(np.where(valid, sample.depth_m, 1.0), *cameras)
-    pred_px = depth_to_disparity(_positive(depth_m), *cameras)
+    """``DISPARITY_METRICS`` of a rectified sample, for ``all`` pixels with ground truth and by region."""
+    (pred_px, true_px), valid = _disparities(sample, depth_m), sample.valid
     masks, hidden = {"all": valid}, sample.occluded
     if hidden is None and valid.mean() > DENSE:
-        hidden = metrics.hidden_by_truth(true_px, valid)
+        hidden = metrics.occluded_by_ground_truth(true_px, valid)
     if hidden is not None:
         masks["visible"] = valid & ~hidden & ~out_of_view(sample)
     edge = metrics.near_disparity_steps(true_px, valid)
@@ -225,10 +221,35 @@ def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Sco
     }
 
 
+def _disparities(sample: StereoSample, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return predicted and true disparity, ``(H, W)`` pixels, of a rectified sample; NaN in holes."""
+    cameras = (sample.K_left, sample.K_right, sample.E_scored)
+    true_px = depth_to_disparity(np.where(sample.valid, sample.depth_m, 1.0), *cameras)
+    return depth_to_disparity(_positive(depth_m), *cameras), true_px
+
+
+def benchmark_scores(sample: StereoSample, prediction: Prediction) -> Scores | None:
+    """Return the fraction of bad pixels by the rules of the sample's benchmark; ``None`` if it has none.
+
+    ``all``: pixels with ground truth, ``None`` if occluded pixels have none. ``noc``: without pixels that the
+    data set marks as occluded, ``None`` without such a mask.
+    """
+    limit_px = DATASETS[sample.dataset].bad_px
+    if limit_px is None or prediction.depth_m is None or not sample.rectified:
+        return None
+    pred_px, true_px = _disparities(sample, prediction.depth_m)
+    masks = {"all": None if sample.notes.get("noc_only") else sample.valid}
+    masks["noc"] = None if sample.occluded is None else sample.valid & ~sample.occluded
+    scores: Scores = {"bad_px": limit_px}
+    for name, mask in masks.items():
+        scores[name] = None if mask is None else metrics.bad_fraction(pred_px, true_px, mask, limit_px)
+    return _plain(scores)
+
+
 def _metric_scores(sample: StereoSample, prediction: Prediction, kept: np.ndarray) -> dict[str, Any]:
-    """What only a map in metres has: see ``score``."""
-    depth_m, truth, valid = prediction.depth_m, sample.depth_m, sample.valid
-    names = ("disparity", "ause", "confidence", "ause_confidence", "boundaries")
+    """Return the metrics of metric maps only; see ``score``."""
+    depth_m, ground_truth, valid = prediction.depth_m, sample.depth_m, sample.valid
+    names = ("disparity", "ause", "confidence", "ause_confidence", "risk_coverage", "boundaries")
     record: dict[str, Any] = dict.fromkeys(names)
     if depth_m is None:
         return record
@@ -236,61 +257,65 @@ def _metric_scores(sample: StereoSample, prediction: Prediction, kept: np.ndarra
         by_mask = disparity_scores(sample, depth_m)
         record["disparity"] = by_mask.pop("all") | {"regions": by_mask}
     if prediction.uncertainty is not None:
-        record |= _plain({"ause": metrics.ause(depth_m, truth, kept, prediction.uncertainty)})
+        record |= _plain({"ause": metrics.ause(depth_m, ground_truth, kept, prediction.uncertainty)})
     if (confidence := prediction.confidence) is not None:
-        deciles = metrics.confidence_deciles(depth_m, truth, kept, confidence, RIGHT_WITHIN)
+        deciles = metrics.confidence_deciles(depth_m, ground_truth, kept, confidence, RIGHT_WITHIN)
         record["confidence"] = [_plain(decile) for decile in deciles]
         orders = {"ause": -confidence, "random": None}
-        areas = {name: metrics.ause(depth_m, truth, kept, order) for name, order in orders.items()}
+        areas = {name: metrics.ause(depth_m, ground_truth, kept, order) for name, order in orders.items()}
         record["ause_confidence"] = _plain(areas)
+        curve = metrics.risk_coverage(depth_m, ground_truth, kept, -confidence, RISK_STEPS)
+        record["risk_coverage"] = {
+            name: [float(f"{value:.7g}") for value in getattr(curve, name)] for name in ("risk", "oracle")
+        }
     if valid.mean() > DENSE:
-        f1 = {"f1": metrics.boundary_f1(depth_m, truth, valid)}
-        record["boundaries"] = _plain(f1 | metrics.boundary_errors(depth_m, truth, valid))
+        f1 = {"f1": metrics.boundary_f1(depth_m, ground_truth, valid)}
+        record["boundaries"] = _plain(f1 | metrics.boundary_errors(depth_m, ground_truth, valid))
     return record
 
 
-def in_metres(prediction: Prediction, truth: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """``(H, W)`` metres as they come out; of relative depth, aligned with the truth."""
+def in_metres(prediction: Prediction, ground_truth: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Return ``(H, W)`` metres as predicted; relative depth is aligned with ground truth."""
     if prediction.depth_m is not None:
         return prediction.depth_m
     assert prediction.relative is not None  # a prediction has one of the two
-    return metrics.align(prediction.relative, truth, kept, prediction.space)
+    return metrics.align(prediction.relative, ground_truth, kept, prediction.space)
 
 
 def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
-    """Every metric of one prediction, as JSON values; ``None`` where it does not apply.
+    """Return all metrics of one prediction as JSON values; ``None`` if not applicable.
 
-    ``capped`` is without truth from ``cap_m`` metres on, and so are ``regions``. ``ValueError`` for a map of
-    the wrong shape or a sample without truth.
+    ``capped`` ignores ground truth from ``cap_m`` metres on, as do ``regions``. ``ValueError`` for a map of
+    the wrong shape or a sample without ground truth.
     """
-    truth, valid = sample.depth_m, sample.valid
+    ground_truth, valid = sample.depth_m, sample.valid
     for name in ("depth_m", "relative", "uncertainty", "confidence"):
         values = getattr(prediction, name)
-        if values is not None and values.shape != truth.shape:
-            bad_value(f"prediction.{name}", f"of the left image's shape {truth.shape}", values.shape)
-    sample.check_truth()
+        if values is not None and values.shape != ground_truth.shape:
+            bad_value(f"prediction.{name}", f"of the left image's shape {ground_truth.shape}", values.shape)
+    sample.check_ground_truth()
     values, depth_m, space = prediction.relative, prediction.depth_m, prediction.space
     if values is None:
-        # Metres are aligned in the prior's own space, as its relative map would be.
+        # Metric maps are aligned in the prior's space, as its relative map would be.
         values = depth_m if space == "depth" else metrics.to_space(_positive(depth_m), space)
 
     def both(cap: float | None) -> dict[str, Scores | None]:
-        aligned_m = metrics.align(values, truth, metrics.counted(truth, valid, cap), space)
-        raw = None if depth_m is None else _plain(metrics.evaluate_depth(depth_m, truth, valid, cap))
-        return {"raw": raw, "aligned": _plain(metrics.evaluate_depth(aligned_m, truth, valid, cap))}
+        aligned_m = metrics.align(values, ground_truth, metrics.counted(ground_truth, valid, cap), space)
+        raw = None if depth_m is None else _plain(metrics.evaluate_depth(depth_m, ground_truth, valid, cap))
+        return {"raw": raw, "aligned": _plain(metrics.evaluate_depth(aligned_m, ground_truth, valid, cap))}
 
     record: dict[str, Any] = {"all_pixels": both(None)}
     record["capped"] = record["all_pixels"] if cap_m is None else both(cap_m)
-    kept = metrics.counted(truth, valid, cap_m)
-    shown_m, errors = in_metres(prediction, truth, kept), {}
+    kept = metrics.counted(ground_truth, valid, cap_m)
+    shown_m, errors = in_metres(prediction, ground_truth, kept), {}
     for name, mask in regions(sample).items():
         if (mask & kept).any():
-            errors[name] = metrics.evaluate_depth(shown_m, truth, mask & kept, cap_m)["abs_rel"]
+            errors[name] = metrics.evaluate_depth(shown_m, ground_truth, mask & kept, cap_m)["abs_rel"]
     return record | _metric_scores(sample, prediction, kept) | {"regions": _plain(errors)}
 
 
 def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str = "") -> str:
-    """Name of a result: it changes with what is in a sample's files, wherever they lie, and all else."""
+    """Return the key of a result, from the content of a sample's files (not paths) and all settings."""
     files = {name: value for name, value in ref.files.items() if value is not None}
     return fingerprint(method, configuration, prior, __version__, ref.dataset, ref.name, files)
 
@@ -298,7 +323,7 @@ def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: 
 def _measure(
     ref: SampleRef, read: Any, method: Method, settings: Settings, priors: PriorCache, path: Path | None
 ) -> Record:
-    """Run one method on one sample and score it; the seconds are those that the method takes alone."""
+    """Run one method on one sample and score it; seconds include only the method."""
     sample, process = read(ref), {"process": Shard.of(None).index}
     priors.evidence.take_spared_seconds()
     start = time.perf_counter()
@@ -310,6 +335,7 @@ def _measure(
     seconds = time.perf_counter() - start + priors.evidence.take_spared_seconds()
     cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
     scores = score(sample, prediction, DATASETS[sample.dataset].cap_m)
+    scores["benchmark"] = benchmark_scores(sample, prediction)
     notes: dict[str, Any] = {"notes": {"sample": dict(sample.notes), "method": dict(prediction.notes)}}
     if path is not None and prediction.depth_m is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -319,18 +345,23 @@ def _measure(
 
 
 def _has_map(cell: Item, record: Record) -> bool:
-    """Whether the map that a cell is to save is there, and not that of other settings in its place."""
+    """Whether the map that a cell saves exists, and has the same settings."""
     path = cell.payload.keywords.get("path")
     if path is None or record["status"] != "ok" or record["all_pixels"]["raw"] is None:
         return True
     return path.is_file() and record.get("map") == file_digest(path)
 
 
+def map_path(out: Path, method: str, dataset: str, sample: str) -> Path:
+    """Return the file in ``--out`` to which the depth map of a method on a sample is saved."""
+    return out / "depth" / re.sub(r"[^\w.=+-]+", "_", method) / f"{dataset}_{sample}.npy"
+
+
 def method_cells(
     refs: Sequence[SampleRef], methods: Sequence[str], settings: Settings, out: Path, save_depth: bool = False
 ) -> list[Item]:
-    """A cell for every method on every sample, all of ``RECORDS_NAME``; with ``save_depth`` also maps."""
-    # One sample, read once, serves all its methods.
+    """Return a cell per method and sample in ``RECORDS_NAME``; with ``save_depth`` also saves maps."""
+    # One sample, read once, is used for all its methods.
     shard, priors, read = Shard.of(None), PriorCache(), lru_cache(maxsize=1)(load)
     several = not shard.whole
     if several and settings.device == "cuda":
@@ -341,8 +372,7 @@ def method_cells(
         prior = f"{chosen.prior} {priors.fingerprint(chosen)}" if method.uses_prior else ""
         device = chosen.device.partition(":")[0] if several else chosen.device
         configuration = method.configuration(replace(chosen, device=device))
-        folder = out / "depth" / re.sub(r"[^\w.=+-]+", "_", method.name)
-        path = folder / f"{ref.dataset}_{ref.name}.npy" if save_depth else None
+        path = map_path(out, method.name, ref.dataset, ref.name) if save_depth else None
         work = partial(_measure, ref, read, method, chosen, priors, path=path)
         head = {"dataset": ref.dataset, "sample": ref.name, "method": method.name}
         key, name = cell_key(ref, method.base_name, configuration, prior), f"{ref.label}, {method.name}"

@@ -1,4 +1,4 @@
-"""Options of every command of ``geodiff eval``, and the table of the commands; nothing here imports torch."""
+"""Define the commands of ``geodiff eval`` and their options, without importing torch."""
 
 from __future__ import annotations
 
@@ -9,37 +9,32 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from geodiff_plugin._lazy import imported
+from geodiff_plugin._internal.lazy import imported
 from geodiff_plugin.options import (
     DTYPES,
-    OTHERS,
+    MACHINE_RULES,
     OUTPUT,
     PRIOR,
     SAMPLES,
     Command,
+    MachineOptions,
     PriorOptions,
     SpeedOptions,
-    check_engine,
-    check_options,
-    declare,
-    engine_option,
-    flag_of,
-    gpus_option,
-    rules_of,
-    workers_option,
+    check_rules,
 )
+from geodiff_plugin.settings import DEFAULT_SECTION, check_settings, setting, settings_of
 
 if TYPE_CHECKING:
     from geodiff_plugin.evaluation.baselines import Settings
 
 PEERS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
-FIGURES = ("gs-sweep", "inner-steps", "ablation", "qualitative")
-#: How the commands here are typed; a checkout has more of them, which are typed differently.
+FIGURES = ("gs-sweep", "guidance-steps", "risk-coverage", "ablation", "qualitative")
+#: Program name of these commands. A source checkout has further commands with another program name.
 PROGRAM = "geodiff eval"
 
 
 class CaptureRow(NamedTuple):
-    """A row of ``geodiff eval capture``: the poses of the capture, and the knob ``pose`` of every call."""
+    """A row of ``geodiff eval capture``: poses of the capture, and the parameter ``pose`` of every call."""
 
     title: str
     poses: str
@@ -47,60 +42,60 @@ class CaptureRow(NamedTuple):
 
 
 CAPTURE_ROWS = {
-    "given": CaptureRow("poses as given", poses="given", pose="given"),
-    "pairs": CaptureRow("refined by pairs", poses="given", pose="refine"),
-    "capture": CaptureRow("solved over the capture", poses="refined", pose="given"),
+    "given": CaptureRow("given poses", poses="given", pose="given"),
+    "pairs": CaptureRow("refined per pair", poses="given", pose="refine"),
+    "capture": CaptureRow("refined over the capture", poses="refined", pose="given"),
 }
 
 
 def out_folder(folder: str) -> Any:
-    """The folder of a run, by default this one."""
-    return declare(
-        Path(folder), "Folder of records and results; a run in it is resumed.", "--out", "-o", panel=OUTPUT
+    """Create the option for the output folder of a run."""
+    return setting(
+        Path(folder), "Output folder; an earlier run in it is resumed.", "--out", "-o", section=OUTPUT
     )
 
 
 def listed(default: tuple[Any, ...], help_text: str, **rules: Any) -> Any:
-    """A tuple that is typed with commas."""
-    return declare(default, help_text, split=True, **{"panel": SAMPLES, **rules})
+    """Create a comma-separated option."""
+    return setting(default, help_text, comma_separated=True, **{"section": SAMPLES, **rules})
 
 
 def some_of(names: Collection[str]) -> Any:
-    """Some of these names, by default all."""
-    return listed(tuple(names), f"Which of {', '.join(names)}, separated by commas.", choices=names)
+    """Create a comma-separated option with some of these names (default: all)."""
+    return listed(tuple(names), f"Rows, separated by commas: {', '.join(names)}.", choices=names)
 
 
 def count_of(
-    default: int | None, help_text: str, low: int = 1, high: int = 10**9, panel: str = SAMPLES
+    default: int | None, help_text: str, low: int = 1, high: int = 10**9, section: str = SAMPLES
 ) -> Any:
-    """A whole number in [low, high]."""
-    return declare(default, help_text, low=low, high=high, panel=panel)
+    """Create an option for an integer in [low, high]."""
+    return setting(default, help_text, low=low, high=high, section=section)
 
 
 def folder_of(help_text: str, *flags: str, default: Any = None) -> Any:
-    """A folder, or a registered data set such as the renderer's."""
-    return declare(default, help_text, *flags, metavar="DIR", panel=SAMPLES)
+    """Create an option for a folder or the name of a registered data set."""
+    return setting(default, help_text, *flags, metavar="DIR", section=SAMPLES)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutOptions:
-    """What every command is told."""
+    """Options of every command."""
 
-    seed: int = declare(0, "Seed of the noise.", panel=PRIOR)
+    seed: int = setting(0, "Random seed of the noise.", section=PRIOR)
     steps: int | None = count_of(
-        None, "Denoising steps (default: each method's own).", high=1000, panel=PRIOR
+        None, "Number of denoising steps (default: each method's own).", high=1000, section=PRIOR
     )
     out: Path = out_folder("geodiff-eval")
-    results: Path | None = declare(None, "Also write the page as Markdown to this file.", panel=OUTPUT)
-    quiet: bool = declare(False, "Show no progress bar and no result.", "--quiet", "-q", panel=OUTPUT)
+    results: Path | None = setting(None, "Also write the results as Markdown to this file.", section=OUTPUT)
+    quiet: bool = setting(False, "Hide the progress bar and the results.", "--quiet", "-q", section=OUTPUT)
     program: str = field(default=PROGRAM)
 
     def __post_init__(self) -> None:
-        check_options(self)
+        check_settings(self)
 
     @property
     def settings(self) -> Settings:
-        """What methods are given; imports torch."""
+        """Return the settings of the methods; imports torch."""
         from geodiff_plugin.evaluation.baselines import Settings
         from geodiff_plugin.runtime.machine import pick_device
 
@@ -110,144 +105,142 @@ class OutOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EvalOptions(SpeedOptions, OutOptions, PriorOptions):
-    """What every command that runs a prior is told."""
+    """Options of every command that runs a prior."""
 
-    dtype: str = declare(
-        "float32", f"Number format of the prior: {', '.join(DTYPES)}.", choices=DTYPES, panel=PRIOR
+    dtype: str = setting(
+        "float32", f"Precision of the prior: {', '.join(DTYPES)}.", choices=DTYPES, section=PRIOR
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class SampleOptions(EvalOptions):
-    """Which samples, of what data."""
+    """Options that select data sets and samples."""
 
-    data: Path | None = folder_of("Folder with data sets, or the name of a registered set.")
+    data: Path | None = folder_of("Folder with data sets, or the name of a registered data set.")
     methods: tuple[str, ...] = listed(
-        (), "Further methods, separated by commas; geodiff eval list names them."
+        (), "Additional methods, separated by commas; geodiff eval list shows them."
     )
     datasets: tuple[str, ...] = listed((), "Data sets, separated by commas (default: all in the folder).")
     scenes: tuple[str, ...] = listed(
-        (), "Keep samples whose names hold one of these words, separated by commas."
+        (), "Only samples whose names contain one of these words, separated by commas."
     )
     limit: int | None = count_of(
-        None, "Number of samples taken, from the first; in a table of the paper, of each data set."
+        None, "Maximum number of samples, from the first; in a table of the paper, per data set."
     )
-    ensemble: int = count_of(1, "Members of the ensemble.", high=1000, panel=PRIOR)
-    resolution: int | None = count_of(
-        None, "Longer side of the image for the prior, in pixels.", 0, 8192, PRIOR
-    )
-    views: int = count_of(2, "Number of views taken of a scene that has more than two.", 2, 100)
-    perturb: str | None = declare(
+    ensemble: int = count_of(1, "Number of ensemble members.", high=1000, section=PRIOR)
+    resolution: int | None = count_of(None, "Longer side of the prior's input in pixels.", 0, 8192, PRIOR)
+    views: int = count_of(2, "Number of views used of a scene with more than two.", 2, 100)
+    perturb: str | None = setting(
         None,
-        "Make the poses wrong, by a turn in degrees and a shift as a share of the baseline.",
-        metavar="DEGREES,SHARE",
-        panel=SAMPLES,
+        "Perturb the poses by a rotation in degrees and a translation as a fraction of the baseline.",
+        metavar="DEGREES,FRACTION",
+        section=SAMPLES,
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairsOptions(SampleOptions):
-    """What the tables over pairs are told: the paper's, of parts, of flatness, of cost."""
+    """Options of the tables over pairs: paper tables, parts, flatness and cost."""
 
-    sample: int | None = count_of(None, "Number of samples drawn at random, by --seed.")
-    pairs: str = declare(
+    sample: int | None = count_of(None, "Number of random samples, drawn with --seed.")
+    pairs: str = setting(
         "default",
-        "Pairs of posed views: default (two a scene) or all.",
+        "Pairs of posed views: default (two per scene) or all.",
         choices=("default", "all"),
-        panel=SAMPLES,
+        section=SAMPLES,
     )
-    pixel_centre: float | None = declare(
+    pixel_centre: float | None = setting(
         None,
-        "Coordinate of the first pixel's centre in posed cameras: 0, or 0.5 as COLMAP has it.",
-        panel=SAMPLES,
+        "Coordinate of the centre of the first pixel in posed cameras: 0, or 0.5 as in COLMAP.",
+        section=SAMPLES,
     )
-    stop_on_broken: bool = declare(
-        False, "End at the first broken sample, instead of leaving it out and saying so.", panel=OUTPUT
+    stop_on_broken: bool = setting(
+        False, "Stop at the first broken sample, instead of skipping and reporting it.", section=OUTPUT
     )
-    skip_broken: bool = declare(
-        False, "Deprecated and without effect: broken samples are left out by default.", panel=OUTPUT
-    )
-    save_depth: bool = declare(False, "Also write every depth map as .npy.", panel=OUTPUT)
+    save_depth: bool = setting(False, "Also write every depth map as .npy.", section=OUTPUT)
 
 
-#: Members of the ensemble whose numbers the paper prints (S5.1).
+#: Number of ensemble members in the paper (S5.1).
 PAPER_ENSEMBLE = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class PaperOptions(PairsOptions):
-    """The tables of the paper, as the paper made them."""
+    """Options of the paper's tables, with the paper's defaults."""
 
     ensemble: int = count_of(
-        PAPER_ENSEMBLE, "Members of the ensemble; the paper has ten.", high=1000, panel=PRIOR
+        PAPER_ENSEMBLE, "Number of ensemble members; the paper uses ten.", high=1000, section=PRIOR
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class DirOptions(PairsOptions):
-    """``geodiff eval pairs DIR``."""
+class DirOptions(MachineOptions, PairsOptions):
+    """Options of ``geodiff eval pairs DIR``."""
 
     data: Path | None = folder_of(
-        "Folder of data sets, or the name of a registered set.", "", default=MISSING
+        "Folder of data sets, or the name of a registered data set.", "", default=MISSING
     )
-    methods: tuple[str, ...] = listed(PEERS, "Methods, separated by commas; geodiff eval list names them.")
-    engine: str = engine_option()
-    workers: int | None = workers_option()
-    gpus: float | None = gpus_option()
+    methods: tuple[str, ...] = listed(PEERS, "Methods, separated by commas; geodiff eval list shows them.")
+    split: str = setting(
+        "all",
+        "Pairs: all, tuned (constants were chosen on them), or unseen (nothing was tuned on them).",
+        choices=("all", "tuned", "unseen"),
+        section=SAMPLES,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_engine(self)
+        check_rules(self, MACHINE_RULES)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FigureOptions(SampleOptions):
-    """``geodiff eval figure NAME``."""
+    """Options of ``geodiff eval figure NAME``."""
 
-    name: str = declare(MISSING, f"Which figure: {', '.join(FIGURES)}.", "", metavar="NAME")
-    max: float = declare(80.0, "gs-sweep: the last g_s, in metres.", low=1.01, high=1e6)
+    name: str = setting(MISSING, f"Figure: {', '.join(FIGURES)}.", "", metavar="NAME")
+    max: float = setting(80.0, "gs-sweep: largest g_s, in metres.", low=1.01, high=1e6)
     updates: tuple[int, ...] = listed(
         (1, 2, 5, 10, 20, 40),
-        "inner-steps: numbers of updates per step, separated by commas.",
-        panel=OTHERS,
+        "guidance-steps: numbers of gradient updates per denoising step, separated by commas.",
+        section=DEFAULT_SECTION,
         low=1,
         high=10**4,
     )
     results: Path | None = field(default=None)
-    clouds: bool = declare(False, "qualitative, ablation: also draw point clouds from another view.")
+    clouds: bool = setting(False, "qualitative, ablation: also draw point clouds from another viewpoint.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosesOptions(EvalOptions):
-    """``geodiff eval poses``."""
+    """Options of ``geodiff eval poses``."""
 
-    data: Path | None = folder_of("Folder of pairs, or the name of a registered set (default: none).")
-    limit: int | None = count_of(None, "Number of pairs of --data taken, from the first.")
-    exact: Path | None = folder_of("The same, of pairs whose poses are exact and are made wrong here.")
-    perturb: str = declare(
+    data: Path | None = folder_of("Folder of pairs, or the name of a registered data set (default: none).")
+    limit: int | None = count_of(None, "Maximum number of pairs of --data, from the first.")
+    exact: Path | None = folder_of("Folder or name of pairs with exact poses, which are perturbed.")
+    perturb: str = setting(
         "1.5,0.1",
-        "How wrong, with --exact: a turn in degrees, a shift as a share of the baseline.",
-        metavar="DEGREES,SHARE",
+        "Perturbation of --exact: a rotation in degrees and a translation as a fraction of the baseline.",
+        metavar="DEGREES,FRACTION",
     )
-    drift: str = declare(
+    drift: str = setting(
         "0.3,1.5",
-        "How wrong, of rectified pairs: turn and shift of the right image.",
+        "Perturbation of rectified pairs: rotation and shift of the right image.",
         metavar="DEGREES,PIXELS",
     )
-    resolution: int | None = count_of(
-        None, "Longer side of the image for the prior, in pixels.", 0, 8192, PRIOR
-    )
+    resolution: int | None = count_of(None, "Longer side of the prior's input in pixels.", 0, 8192, PRIOR)
     out: Path = out_folder("geodiff-poses")
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureEvalOptions(EvalOptions):
-    """``geodiff eval capture DIR ...``."""
+    """Options of ``geodiff eval capture DIR ...``."""
 
-    data: tuple[Path, ...] = folder_of("Captures that name depth maps of their frames.", "", default=MISSING)
-    frames: str | None = declare(None, "Frames, NAME,NAME or FIRST:LAST:STEP (default: all).", panel=SAMPLES)
+    data: tuple[Path, ...] = folder_of("Captures with ground-truth depth maps.", "", default=MISSING)
+    frames: str | None = setting(
+        None, "Frames: NAME,NAME or FIRST:LAST:STEP (default: all).", section=SAMPLES
+    )
     count: int | None = count_of(
-        None, "Number of frames of each capture, evenly spread, instead of --frames.", 2
+        None, "Number of evenly spaced frames of each capture, instead of --frames.", 2
     )
     neighbours: tuple[int, ...] = listed(
         (2, 3, 5), "Numbers of right views, separated by commas.", low=1, high=32
@@ -256,12 +249,12 @@ class CaptureEvalOptions(EvalOptions):
 
 
 def _run(name: str, where: str, options: OutOptions) -> Any:
-    """The page, the path of a figure, or ``None`` in a process that writes nothing."""
+    """Run a command; returns the page, the path of a figure, or ``None`` in a process without output."""
     return imported(f"evaluation.{where}")(name, options)
 
 
 class _Entry(NamedTuple):
-    """A command: its options, its function as ``module.name`` of the evaluation, and its help."""
+    """A command: its options, its function as ``module.name`` in ``evaluation``, and its help."""
 
     options: type[OutOptions]
     where: str
@@ -274,47 +267,54 @@ _TABLE = {
     "pairs": _Entry(
         DirOptions,
         "pairs.run_pairs",
-        "Compare methods on every pair below DIR whose depth is known in metres.",
+        "Compare methods on all pairs in DIR with metric ground truth.",
     ),
     "table1": _Entry(
         PaperOptions, _PAPER, "Table 1 of the paper: KITTI, Booster and Middlebury, in metres and aligned."
     ),
-    "table2": _Entry(PaperOptions, _PAPER, "Table 2 of the paper: Booster, beside stereo matching."),
+    "table2": _Entry(PaperOptions, _PAPER, "Table 2 of the paper: Booster, compared with stereo matching."),
     "table3": _Entry(PaperOptions, _PAPER, "Table 3 of the paper: two posed views of Tanks and Temples."),
     "ablation": _Entry(
-        PaperOptions, _PAPER, "Table 4 of the paper, and one change at a time: gradients, rules, terms."
+        PaperOptions, _PAPER, "Table 4 of the paper, and one change at a time: gradients, optimizers, terms."
     ),
-    "parts": _Entry(PairsOptions, _CHANGES, "The default, with one part left out at a time."),
-    "flatness": _Entry(PairsOptions, _CHANGES, "The default, with one number halved or doubled at a time."),
-    "cost": _Entry(PairsOptions, "pairs.run_cost", "Seconds and peak memory, plain against guided."),
+    "parts": _Entry(PairsOptions, _CHANGES, "Ablation: the default without one part at a time."),
+    "flatness": _Entry(
+        PairsOptions, _CHANGES, "Sensitivity: the default with one parameter halved or doubled at a time."
+    ),
+    "cost": _Entry(PairsOptions, "pairs.run_cost", "Run time and peak memory, plain and guided."),
     "figure": _Entry(FigureOptions, "figures.run_figure", "Draw a figure as PNG, with its numbers as JSON."),
+    "baseline": _Entry(
+        PairsOptions,
+        "baseline_scale.run_baseline_scale",
+        "Measure whether depth follows the baseline at half and twice its length, and another right K.",
+    ),
     "poses": _Entry(PosesOptions, "poses.run_poses", "Compare given, refined, estimated and wrong poses."),
     "capture": _Entry(
         CaptureEvalOptions, "captures.run_capture_eval", "Evaluate captures (needs the extra 'capture')."
     ),
 }
-#: Every command but ``list``, by name.
+#: All commands except ``list``, by name.
 COMMANDS = {
     name: Command(entry.options, partial(_run, name, entry.where), entry.about)
     for name, entry in _TABLE.items()
 }
 
 
-#: Options that change no number of a page.
+#: Options that do not change the numbers of a page.
 CHANGE_NO_NUMBER = frozenset(
-    {"out", "results", "quiet", "skip_broken", "stop_on_broken", "save_depth", "engine", "workers", "gpus"}
+    {"out", "results", "quiet", "stop_on_broken", "save_depth", "engine", "workers", "gpus"}
 )
 
 
-def command_line(name: str, options: Any) -> str:
-    """The command line that gives these options, defaults and what changes no number left out."""
-    words = [*options.program.split(), name]
-    for each in fields(options):
-        value, rules = getattr(options, each.name), rules_of(each)
-        if rules is None or each.name in CHANGE_NO_NUMBER or value == each.default:
+def command_line(command: str, options: Any) -> str:
+    """Return the command line of these options, without defaults and ``CHANGE_NO_NUMBER``."""
+    words = [*options.program.split(), command]
+    for name, option in settings_of(type(options)).items():
+        value = getattr(options, name)
+        if name in CHANGE_NO_NUMBER or value == option.default:
             continue
-        flag = [] if rules.is_argument else [flag_of(each)]
-        entries = value if isinstance(value, tuple) and not rules.split else (value,)
+        flag = [] if option.is_argument else [option.flag]
+        entries = value if option.several and not option.comma_separated else (value,)
         for entry in entries:
             text = ",".join(map(str, entry)) if isinstance(entry, tuple) else str(entry)
             words += flag + ([] if entry is True else [text])

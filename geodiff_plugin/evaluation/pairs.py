@@ -1,4 +1,4 @@
-"""Methods side by side on pairs: ``geodiff eval pairs``, ``parts``, ``flatness`` and ``cost`` (S5.3, S9)."""
+"""Compares methods on pairs: ``geodiff eval pairs``, ``parts``, ``flatness`` and ``cost`` (S5.3, S9)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from multiprocessing import get_context
 from operator import itemgetter
 from typing import NamedTuple
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.algorithm.gradients import RULES
+from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin.algorithm.optimizers import OPTIMIZERS
 from geodiff_plugin.config import DEFAULT, value_of
 from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import find_method
@@ -21,44 +21,41 @@ from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, select
 from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import DirOptions, PairsOptions
 from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_cell, pairs_of
-from geodiff_plugin.jobs.failures import Failures
-from geodiff_plugin.jobs.journal import Item, Journal, Record, Shard
-from geodiff_plugin.jobs.telling import silent
-from geodiff_plugin.options import on_ray
+from geodiff_plugin.jobs import Item, Journal, Record, Runner, Shard, on_ray, silent
 from geodiff_plugin.priors import PRIORS, find_prior
 
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
-    """Cells of methods on samples, each method once."""
+    """Return cells of methods on samples, each method once."""
     names = tuple(dict.fromkeys(methods))
     return experiment.method_cells(refs, names, options.settings, options.out, options.save_depth)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Methods on pairs, and how the page shows their records."""
+    """Methods on pairs, and the presentation of their records."""
 
     title: str
     refs: Sequence[SampleRef]
     methods: Sequence[str]
     tables: experiment.Tables
-    remarks: Sequence[str] = ()  # after those on what was run
+    remarks: Sequence[str] = ()  # after those about the run
 
 
 def compare(name: str, options: PairsOptions, comparison: Comparison) -> Page | None:
-    """``run_experiment`` of methods on pairs, with remarks on what was run."""
+    """Call ``run_experiment`` for methods on pairs, with remarks about the run."""
     cells = pair_cells(comparison.refs, comparison.methods, options)
 
     def remarks(records: list[Record]) -> list[str]:
         return [*remarks_on(records, options), *comparison.remarks]
 
-    journal = experiment.RECORDS_NAME  # all such commands share their records
+    journal = experiment.RECORDS_NAME  # shared by all such commands
     of_pairs = experiment.Experiment(comparison.title, cells, comparison.tables, remarks, journal)
     return experiment.run_experiment(name, options, of_pairs)
 
 
 def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
-    """Sentences above the tables: the prior, what methods could not do and why, samples that were broken."""
+    """Return remarks above the tables: the prior, methods that were not applicable, broken samples."""
     remarks = [f"Prior {options.prior}, seed {options.seed}, ensemble {options.ensemble}."]
     by_status = tables.grouped(records, "status")
     impossible = tables.grouped(by_status.get("not applicable", ()), "method", "reason")
@@ -75,81 +72,84 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
 
 
 def _measure_on_ray(refs: Sequence[SampleRef], options: DirOptions) -> None:
-    """Measure the cells without a record by Ray; this process tries those that fail there, and tells why."""
-    items_on_actors = on_ray("items_on_actors")
+    """Measure cells without a record with Ray; this process retries those that fail, and reports why."""
     cells = {cell.key: cell for cell in pair_cells(refs, options.methods, options)}
     make = partial(_cells_by_key, options, modules_of_datasets())
     with Journal(options.out / experiment.RECORDS_NAME) as journal:
-        failures = Failures(len(cells), "cell", silent)
-        items_on_actors(list(cells.values()), journal, make, options, failures, not options.quiet)
+        runner = Runner(list(cells.values()), journal, noun="cell", progress=not options.quiet)
+        runner.run_elsewhere(partial(on_ray("items_on_actors"), make, options), silent)
 
 
 def _cells_by_key(options: DirOptions, modules: Sequence[str]) -> Callable[[str], Record]:
-    """What an actor does with the key of a cell."""
+    """Return an actor's function from the key of a cell to its record."""
     _import_all(modules)
     cells = {cell.key: cell for cell in pair_cells(select(options), options.methods, options)}
     return lambda key: cells[key].payload()
 
 
 def run_pairs(name: str, options: DirOptions) -> Page | None:
-    """Measure methods on pairs and write the tables; errors as ``run_experiment``."""
+    """Measure methods on pairs and write the tables; errors as in ``run_experiment``."""
     refs, more = select(options), []
     if options.engine == "ray":
         _measure_on_ray(refs, options)
     if options.sample is not None:
         more.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
-    title = "Results pair by pair"
+    title = "Results per pair"
     return compare(name, options, Comparison(title, refs, options.methods, tables.pairs_tables, more))
 
 
-#: What is changed, by table: ``(row, method)``, the unchanged preset first. ``guided`` and ``paper`` stand
-#: below the paper's Table 4 (no sample has known points); ``parts`` is what goes beyond the paper.
+#: Changes by table: ``(row, method)``, the unchanged preset first. ``guided`` and ``paper`` are below the
+#: paper's Table 4 (no sample has known points); ``parts`` are the extensions beyond the paper.
 CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
     "guided": (
-        ("as it is", "guided"),
+        ("unchanged", "guided"),
         ("scale and shift only", "scale-shift-only"),
         ("reprojection only", "reprojection-only"),
         ("no diffusion", "no-diffusion"),
         ("gradient to z_t (full)", "guided:gradient=full"),
-        *((f"rule {name}", f"guided:rule={name}") for name in RULES if name != "adam"),
+        *((f"optimizer {name}", f"guided:optimizer={name}") for name in OPTIMIZERS if name != "adam"),
         *((f"without {name}", f"guided:weights.{name}=0") for name in DEFAULT.weights if name != "points"),
     ),
     "paper": (
-        ("as it is", "paper"),
+        ("unchanged", "paper"),
         ("scale and shift only", "paper:optimize_latents=false"),
-        ("γ = 0", "paper:weights.prior_pull=0"),
-        # One number that is searched within a thousandth of 1 is 1.
+        ("γ = 0", "paper:weights.affine_reg=0"),
+        # A searched value within a thousandth of 1 is 1.
         ("g_s = 1", "paper:g_s_range=[0.999,1.001]"),
         ("gradient to the clean latent (denoised)", "paper:gradient=denoised"),
-        *((f"rule {name}", f"paper:rule={name}") for name in RULES if name != "summed"),
+        *((f"optimizer {name}", f"paper:optimizer={name}") for name in OPTIMIZERS if name != "summed"),
     ),
     "parts": (
-        ("as it is", "guided"),
+        ("unchanged", "guided"),
         ("search only", "search-only"),
         ("photometric only", "guided:weights.matches=0"),
         ("matches only", "guided:weights.photometric=0"),
         ("no diffusion", "no-diffusion"),
-        ("without correction in the loop", "guided:correct=false"),
-        ("with a correction in every step", "guided:corrections=1000"),
-        ("with gradient updates", "guided:inner_steps=5"),
-        ("without the last fit and crisp edges", "guided:crisp=false"),
+        ("without match fitting in the loop", "guided:fit_matches=false"),
+        ("with match fitting in every step", "guided:match_fits=1000"),
+        ("with gradient updates", "guided:guidance_steps=5"),
+        ("without final fit and edge refinement", "guided:refine_edges=false"),
         ("without rejection of reflections", "guided:reject_reflections=false"),
-        ("without cleaning of photographs", "guided:clean_photographs=false"),
-        ("without exposure", "guided:exposure=false"),
-        ("without z-test", "guided:z_test=false"),
+        ("without image cleaning", "guided:clean_images=false"),
+        ("without exposure compensation", "guided:exposure=false"),
+        ("without occlusion mask", "guided:occlusion_mask=false"),
     ),
 }
-_NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
+_NAMES = {
+    "guided": "The default preset",
+    "paper": "Algorithm 1 as printed",
+    "parts": "Ablation of the default",
+}
 
-#: The numbers that decide the default's result, by knob.
+#: The numbers that determine the default's result, by parameter.
 NUMBERS = (
-    *("min_steps", "corrections", "outlier_width", "match_noise", "smoothness"),
+    *("min_steps", "match_fits", "outlier_sigma", "match_sigma", "smoothness"),
     *("weights.photometric", "weights.matches", "weights.anchor", "sweep_pixels"),
 )
 
 
 def changes_table(records: Sequence[Record], name: str) -> Table:
-    """Every row of ``CHANGES[name]`` that ran, with its paired difference to the unchanged preset."""
+    """Return all rows of ``CHANGES[name]`` that ran, with paired differences to the unchanged preset."""
     abs_rel, delta1 = (tables.metric_values(records, "raw", metric) for metric in ("abs_rel", "delta1"))
     seconds, unchanged, rows = tables.by_method(records, itemgetter("seconds")), CHANGES[name][0][1], []
     for title, method in CHANGES[name]:
@@ -160,43 +160,43 @@ def changes_table(records: Sequence[Record], name: str) -> Table:
             cells.append(tables.mean_with_interval(delta1[method].values()).cell())
             cells.append("-" if method == unchanged else difference)
             rows.append((title, str(len(values)), *cells, mean_cell(seconds[method].values(), 1)))
-    header = ("change", "pairs", "AbsRel ↓ [95 %]", "worst", "δ1 ↑ [95 %]", "AbsRel more", "seconds")
-    note = "Metres as they come out; each change alone, and what the knobs leave open follows it."
-    return Table(f"{_NAMES[name]}, one thing changed, {pairs_of(records)}", header, tuple(rows), note)
+    header = ("change", "pairs", "AbsRel ↓ [95 %]", "worst", "δ1 ↑ [95 %]", "AbsRel change", "seconds")
+    note = "Metric depth without alignment; one change at a time; parameters derived from it follow."
+    return Table(f"{_NAMES[name]}, one change at a time, {pairs_of(records)}", header, tuple(rows), note)
 
 
 def _at(number: str, factor: float) -> str:
-    """The method with a number of the default at a multiple of itself; integers stay integers."""
+    """Return the method with a parameter of the default multiplied by a factor; integers stay integers."""
     value = value_of(number, DEFAULT)
     changed = max(1, round(value * factor)) if isinstance(value, int) else float(f"{value * factor:.6g}")
     return f"guided:{number}={changed:g}"
 
 
-#: The default, and every one of ``NUMBERS`` at half and at twice its value.
+#: The default, and each of ``NUMBERS`` at half and twice its value.
 FLATNESS = ("guided", *(_at(number, factor) for number in NUMBERS for factor in (0.5, 2.0)))
 
 
 def flatness_table(records: Sequence[Record]) -> Table:
-    """Mean AbsRel with every number at half and at twice its value, and the pair that it changes most."""
+    """Return mean AbsRel with each parameter at half and twice its value, and the largest pair change."""
     values = tables.metric_values(records, "raw", "abs_rel")
     unchanged, rows = values.get("guided", {}), []
     for number in NUMBERS:
-        cells, most = [], (0.0, "-")
+        cells, largest = [], (0.0, "-")
         for factor in (0.5, 2.0):
             changed = values.get(_at(number, factor), {})
             shared = [label for label in changed if label in unchanged]
             cells.append(mean_cell([changed[label] for label in shared], 4))
-            most = max([most, *((abs(changed[label] - unchanged[label]), label) for label in shared)])
-        moved = f"{cell(most[0])} ({most[1]})" if most[0] else cell(0.0)
-        rows.append((f"`{number}`", f"{value_of(number, DEFAULT):g}", *cells, moved))
-    title = f"Every number of the default at half and at twice its value, {count_of_pairs(len(unchanged))}"
-    header = ("number", "value", "at half", "at twice", "largest change of a pair")
-    note = f"Mean AbsRel; {mean_cell(unchanged.values(), 4)} as they are."
+            largest = max([largest, *((abs(changed[label] - unchanged[label]), label) for label in shared)])
+        change = f"{cell(largest[0])} ({largest[1]})" if largest[0] else cell(0.0)
+        rows.append((f"`{number}`", f"{value_of(number, DEFAULT):g}", *cells, change))
+    title = f"Each parameter of the default at half and twice its value, {count_of_pairs(len(unchanged))}"
+    header = ("parameter", "value", "at half", "at twice", "largest change of a pair")
+    note = f"Mean AbsRel; {mean_cell(unchanged.values(), 4)} with default values."
     return Table(title, header, tuple(rows), note)
 
 
 def run_changes(name: str, options: PairsOptions) -> Page | None:
-    """Change one thing of the default at a time: its ``parts``, or the numbers of ``flatness``."""
+    """Change one part of the default at a time: its ``parts``, or the numbers of ``flatness``."""
     flat, refs = name == "flatness", select(options)
     methods = FLATNESS if flat else tuple(method for _, method in CHANGES[name])
 
@@ -208,19 +208,17 @@ def run_changes(name: str, options: PairsOptions) -> Page | None:
             return [flatness_table(records), further]
         return [changes_table(records, name), further, tables.details_table(records, tables.REGIONS)]
 
-    title = "Flatness" if flat else "Parts of the default"
+    title = "Hyperparameter sensitivity" if flat else "Ablation"
     return compare(name, options, Comparison(title, refs, (*methods, *options.methods), page_tables))
 
 
-#: The stock pipeline, which everything is compared with; its alignment costs nothing beside it.
+#: The stock pipeline, the reference of all comparisons; the time of its alignment is negligible.
 PLAIN = "prior-aligned"
 COST_METHODS = (PLAIN, "search-only", "guided", "guided:gradient=full", "paper")
-#: Denoising steps when none are asked for: what the default guidance takes of a prior that takes any number.
-STEPS = 4
 
 
 class _Cost(NamedTuple):
-    """What a method took: pairs, median seconds, greatest peak of memory in bytes."""
+    """Cost of a method: pairs, median seconds, peak memory in bytes."""
 
     pairs: int
     seconds: float
@@ -228,14 +226,14 @@ class _Cost(NamedTuple):
 
 
 def cost_table(records: Sequence[Record]) -> Table:
-    """Seconds and memory of every method, and both as multiples of the plain pipeline's."""
+    """Return seconds and memory of every method, absolute and relative to the plain pipeline."""
     costs, rows = dict[str, _Cost](), []
     for method, group in tables.grouped((r for r in records if r["status"] == "ok"), "method").items():
         peak = max(record["peak_bytes"] for record in group)
         costs[method] = _Cost(len(group), statistics.median(record["seconds"] for record in group), peak)
     if PLAIN not in costs:
-        cure = "See geodiff eval cost with --stop-on-broken for the reason."
-        bad_value("the pairs", f"some on which {PLAIN} works", "none", cure)
+        hint = "See geodiff eval cost with --stop-on-broken for the reason."
+        bad_value("the pairs", f"some that {PLAIN} supports", "none", hint)
     plain = costs[PLAIN]
     for method, cost in costs.items():
         title = "plain pipeline" if method == PLAIN else find_method(method).title
@@ -243,23 +241,24 @@ def cost_table(records: Sequence[Record]) -> Table:
         memory = f"{cost.peak / 1e6:.0f}", f"{cost.peak / max(plain.peak, 1):.2f}"
         rows.append((title, str(cost.pairs), *times, *memory))
     note = (
-        "Median seconds and greatest peak over the pairs, each method in a process of its own, all of one "
-        "prior with the same number of denoising steps. On CUDA the peak is what was allocated, weights "
-        "included, reset for each pair; on the CPU it is the increase of resident memory over the start, "
-        "sampled every 50 ms."
+        "Median seconds and maximum peak memory over the pairs, each method in a separate process, all "
+        "with the same "
+        "prior and number of denoising steps. On CUDA the peak is the allocated memory including "
+        "weights, reset for each "
+        "pair; on the CPU it is the increase of resident memory since the start, sampled every 50 ms."
     )
     header = ("method", "pairs", "seconds", "time × plain", "peak MB", "memory × plain")
     return Table(f"Cost on {pairs_of(records)}", header, tuple(rows), note)
 
 
 def _steps_of(prior: str) -> int | None:
-    """``STEPS``, or ``None`` for a prior that was trained for fewer: its own number then."""
-    most = PRIORS[find_prior(prior).key].max_steps
-    return STEPS if most is None or most >= STEPS else None
+    """Return the default guidance's steps; ``None`` (own number) for a prior trained for fewer."""
+    max_steps = PRIORS[find_prior(prior).key].max_steps
+    return DEFAULT.min_steps if max_steps is None or max_steps >= DEFAULT.min_steps else None
 
 
 def _method_records(refs: Sequence[SampleRef], method: str, options: PairsOptions) -> list[Record]:
-    """Records of one method; called in a process of its own."""
+    """Return records of one method; called in a separate process."""
     return experiment.measure_cells(pair_cells(refs, (method,), options), options) or []
 
 
@@ -269,19 +268,19 @@ def _import_all(modules: Sequence[str]) -> None:
 
 
 def modules_of_datasets() -> list[str]:
-    """The modules that another process imports to know every registered data set."""
-    # A file that was run is read again by a new process, but not what `python -m` ran.
+    """Return the modules that another process imports to know every registered data set."""
+    # A new process imports a script that was run as a file, but not a module run with `python -m`.
     return sorted({dataset.load.__module__ for dataset in DATASETS.values()} - {"__main__"})
 
 
 def fresh_process() -> ProcessPoolExecutor:
-    """One new process, which knows every registered data set."""
+    """Return an executor of one new process that knows every registered data set."""
     context, modules = get_context("spawn"), modules_of_datasets()
     return ProcessPoolExecutor(1, mp_context=context, initializer=_import_all, initargs=(modules,))
 
 
 def run_cost(name: str, options: PairsOptions) -> Page:
-    """Measure ``COST_METHODS`` and further ones, and write the table; records go to ``out/cost``."""
+    """Measure ``COST_METHODS`` and further methods, and write the table; records go to ``out/cost``."""
     if not Shard.of(None).whole:
         bad_value("the number of processes", "1 for cost", Shard.of(None).count)
     refs = select(options)
@@ -290,10 +289,10 @@ def run_cost(name: str, options: PairsOptions) -> Page:
     for method in dict.fromkeys((*COST_METHODS, *options.methods)):
         prior = find_method(method).prior or options.prior
         taken[prior] = options.steps or _steps_of(prior)
-        # What one method frees stays with the allocator, where the next would find it at no cost.
+        # Memory freed by one method stays with the allocator, which would favour the next one.
         with fresh_process() as process:
             job = process.submit(_method_records, refs, method, replace(alone, steps=taken[prior]))
             records += job.result()
-    steps = [f"{count or 'its own number'} with {prior}" for prior, count in taken.items()]
-    remarks = (*remarks_on(records, options), f"Denoising steps of each: {', '.join(steps)}.")
+    steps = [f"{count or 'default number'} with {prior}" for prior, count in taken.items()]
+    remarks = (*remarks_on(records, options), f"Denoising steps per method: {', '.join(steps)}.")
     return experiment.write_page(name, options, "Cost", [cost_table(records)], remarks)

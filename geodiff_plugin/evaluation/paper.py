@@ -1,4 +1,4 @@
-"""The paper's tables 1 to 4 as runs, in its layout, with its published numbers beside a full data set."""
+"""Runs the paper's tables 1 to 4 in its layout, with published numbers next to complete data sets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, all_refs, select
@@ -14,11 +14,11 @@ from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions
 from geodiff_plugin.evaluation.pairs import CHANGES, Comparison, changes_table, compare
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs
-from geodiff_plugin.jobs.journal import Record
+from geodiff_plugin.jobs import Record
 
 
 class Column(NamedTuple):
-    """One data set of a table, ``full_count`` pairs in the paper; the first of ``datasets`` that is there."""
+    """A data set of a table, with ``full_count`` pairs in the paper: the first available of ``datasets``."""
 
     title: str
     datasets: tuple[str, ...]
@@ -28,12 +28,12 @@ class Column(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether this is the set as the paper used it, so that its numbers may stand beside."""
+        """Whether this is the set used by the paper, so that its numbers are comparable."""
         return self.dataset == self.datasets[0] and len(self.labels) == self.full_count
 
     @property
     def heading(self) -> str:
-        """The paper's name, the set that stands for it where it is another, the number of pairs."""
+        """Return the paper's name, the set used instead if different, and the number of pairs."""
         if self.dataset is None:
             return f"{self.title} (not found)"
         other = "" if self.dataset == self.datasets[0] else f"{self.dataset}, "
@@ -41,14 +41,14 @@ class Column(NamedTuple):
 
 
 def _is_outside(method: str) -> bool:
-    """Whether the user names the method of a row."""
+    """Whether a row's method is named by the user."""
     return method.startswith(("hf:", "files:"))
 
 
 def _filler(method: str, methods: Sequence[str]) -> str:
-    """Which of the methods fills the row of ``method``, empty where none ran.
+    """Return the method that fills the row of ``method``, empty if none ran.
 
-    files:DIR/unidepth stands for every method with that word after its colon.
+    files:DIR/unidepth matches any method with that word after its colon.
     """
     word = method.rpartition("/")[2].partition("-")[0].lower()
     ran = (n for n in methods if n == method or _is_outside(method) and word in n.lower().partition(":")[2])
@@ -56,7 +56,7 @@ def _filler(method: str, methods: Sequence[str]) -> str:
 
 
 class Row(NamedTuple):
-    """A row of a table; ``published`` are the paper's cells by the title of a column."""
+    """A row of a table; ``published`` are the paper's cells by column title."""
 
     title: str
     aligned: bool
@@ -65,7 +65,7 @@ class Row(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """A table as the paper lays it out; ``methods`` run by default, beside the rows' own."""
+    """A table in the paper's layout; ``methods`` run by default in addition to the rows' own."""
 
     title: str
     columns: tuple[Column, ...]
@@ -74,12 +74,12 @@ class Layout(NamedTuple):
     rows: tuple[Row, ...]
 
 
-#: Metric and its heading; Table 4 has the first two.
+#: Metrics and their headings; Table 4 has the first two.
 METRICS = {"abs_rel": "AbsRel ↓", "delta1": "δ1 ↑", "rmse": "RMSE m ↓"}
 
 
 def _layout(text: str, columns: tuple[Column, ...], methods: tuple[str, ...]) -> Layout:
-    """A layout of text: the title, then rows of title, whether aligned, method, and each column's cells."""
+    """Parse a layout: the title, then rows of title, whether aligned, method, and each column's cells."""
     title, *lines = (line.strip() for line in text.strip().splitlines())
     rows = []
     for line in lines:
@@ -134,13 +134,13 @@ LAYOUTS: dict[str, Layout] = {
     "table3": _layout(_TABLE3, (_TANKS,), _PEERS[:-1]),
     "ablation": _layout(_TABLE4, (_KITTI,), _PARTS),
 }
-"""Every table of the paper by the name of its subcommand."""
+"""All tables of the paper by subcommand."""
 ABLATED = ("guided", "paper")
-"""Keys of ``CHANGES`` whose tables stand below Table 4."""
+"""Keys of ``CHANGES`` whose tables follow Table 4."""
 
 
 def _filled(layout: Layout, methods: Sequence[str], in_metres: Collection[str]) -> list[Row]:
-    """The layout's rows with the methods that fill them, then those of other methods, metres first."""
+    """Return the layout's rows with their methods, then rows of other methods, metric ones first."""
     rows = [row._replace(method=_filler(row.method, methods)) for row in layout.rows]
     taken = {row.method for row in rows}
     for name in (name for name in methods if name not in taken):
@@ -153,7 +153,7 @@ def _filled(layout: Layout, methods: Sequence[str], in_metres: Collection[str]) 
 def layout_table(
     layout: Layout, columns: Sequence[Column], records: Sequence[Record], methods: Sequence[str]
 ) -> Table:
-    """Rows of other methods below the paper's; beside each complete data set the cells as published."""
+    """Return rows of other methods below the paper's; published cells are next to complete data sets."""
     count, values = len(layout.metrics), dict[bool, list[tables.Values]]()
     for kind in ("raw", "aligned"):
         values[kind == "aligned"] = [tables.metric_values(records, kind, metric) for metric in layout.metrics]
@@ -170,7 +170,7 @@ def layout_table(
             cells += [tables.whole_mean([values.get(x) for x in column.labels]) for values in of_method]
             cells += published.get(column.title, ["-"] * count) if column.complete else []
         rows.append(tuple(cells))
-    note = "Capped at 80 m for KITTI and 10 m for Booster. † in metres as they come out."
+    note = "Capped at 80 m for KITTI and 10 m for Booster. † in metres without alignment."
     empty = [
         f"{row.title} (--methods {row.method})"
         for row in layout.rows
@@ -182,7 +182,7 @@ def layout_table(
 
 
 def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
-    """Every method that a table runs: the paper's rows, others beside them, and what the user adds."""
+    """Return all methods of a table: the paper's rows, additional ones, and the user's."""
     layout, changed = LAYOUTS[name], ABLATED if name == "ablation" else ()
     printed = (row.method for row in layout.rows if not _is_outside(row.method))
     names = [*printed, *layout.methods, *added]
@@ -190,11 +190,11 @@ def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
 
 
 def _find(column: Column, options: PairsOptions, draw: bool) -> tuple[Column, list[SampleRef]]:
-    """The column with the first data set that can stand for it, and the samples to measure."""
+    """Return the column with its first available data set, and the samples to measure."""
     wanted = options.datasets or column.datasets
     for dataset in (name for name in column.datasets if name in wanted):
         refs = all_refs(options, (dataset,))
-        # One column may have what --scenes names while another has not.
+        # --scenes may match samples of one column only
         refs = [ref for ref in refs if not options.scenes or any(s in ref.label for s in options.scenes)]
         if refs:
             drawn = column.full_count if draw and column.full_count <= len(refs) else None
@@ -204,15 +204,15 @@ def _find(column: Column, options: PairsOptions, draw: bool) -> tuple[Column, li
 
 
 def _ablation_columns(options: PairsOptions) -> tuple[Column, ...]:
-    """KITTI where it is there, and everything else that is."""
-    there = {ref.dataset for ref in all_refs(options)}
-    kitti = (_KITTI,) if there & set(_KITTI.datasets) else ()
-    others = (Column(name, (name,), 0) for name in DATASETS if name in there - set(_KITTI.datasets))
+    """Return KITTI if available, and all other data sets found."""
+    available = {ref.dataset for ref in all_refs(options)}
+    kitti = (_KITTI,) if available & set(_KITTI.datasets) else ()
+    others = (Column(name, (name,), 0) for name in DATASETS if name in available - set(_KITTI.datasets))
     return (*kitti, *others) or (_KITTI,)
 
 
 def run_paper_table(name: str, options: PairsOptions) -> Page | None:
-    """Measure what one table of the paper needs, and write it; ``options.methods`` are run beside its own."""
+    """Measure one table of the paper and write it, with additional ``options.methods``."""
     layout, posed, ablation = LAYOUTS[name], name == "table3", name == "ablation"
     if options.data is None and not ablation:
         obtain = " ".join(f"{c.title}: {DATASETS[c.datasets[0]].obtain}" for c in layout.columns)
@@ -220,7 +220,7 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
     if posed:
         options = replace(options, pairs="all")
     columns = _ablation_columns(options) if ablation else layout.columns
-    # The paper drew its posed pairs at random, and so does the table where there are enough to draw from.
+    # The paper drew its posed pairs at random; so does this table if there are enough.
     chosen = [_find(column, options, draw=posed) for column in columns]
     refs = [ref for _, members in chosen for ref in members]
     missing = ((c.title, DATASETS[c.datasets[0]].obtain) for c, members in chosen if not members)

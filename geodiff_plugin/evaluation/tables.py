@@ -1,4 +1,4 @@
-"""Tables in Markdown, LaTeX and JSON: means with intervals, and those of a comparison of methods."""
+"""Tables in Markdown, LaTeX and JSON: means with intervals, and comparisons of methods."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from geodiff_plugin.evaluation.baselines import find_method
-from geodiff_plugin.jobs.journal import Record
+from geodiff_plugin.evaluation.datasets.splits import TITLES, split_of
+from geodiff_plugin.jobs import Record
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
 
-#: Below this number of images there is no interval: resampling four values says nothing.
-FEWEST_FOR_INTERVAL = 5
-#: Column headings of the depth metrics, by their names in a record.
+#: Minimum number of images for an interval: resampling fewer values is meaningless.
+MIN_IMAGES_FOR_INTERVAL = 5
+#: Column headings of the depth metrics by their names in a record.
 HEADINGS = {"abs_rel": "AbsRel", "delta1": "δ1", "delta2": "δ2", "delta3": "δ3"}
 HEADINGS |= {"rmse": "RMSE m", "log_rmse": "log RMSE", "silog": "SILog"}
 
-#: What LaTeX reads as a command, or lacks.
+#: Characters that LaTeX interprets as commands, or lacks.
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _LATEX |= {character: f"\\{character}" for character in "_%&#${}"}
 _LATEX |= {"<": "$<$", ">": "$>$", "|": "$|$", "δ": r"$\delta$", "γ": r"$\gamma$", "ε": r"$\epsilon$"}
@@ -28,18 +29,18 @@ _LATEX |= {"±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "†": 
 _LATEX |= {"✓": r"$\checkmark$", "✗": r"$\times$", "×": r"$\times$"}
 
 ValueOf = Callable[[Record], float | None]
-#: Records of one row -> what stands in a column.
+#: Function from the records of a row to a cell.
 CellOf = Callable[[list[Record]], str]
-#: Method -> label of the pair -> a number.
+#: Method -> label of the pair -> value.
 Values = dict[str, dict[str, float]]
-#: Heading and records of a column; numbers of all pairs and digits -> their mean.
+#: Columns: heading and records.
 Columns = Iterable[tuple[str, Sequence[Record]]]
 MeanOf = Callable[[list[float | None], int], str]
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean of ``count`` numbers, NaN of none, with an interval from ``FEWEST_FOR_INTERVAL`` on."""
+    """A mean of ``count`` numbers (NaN if none), with an interval from ``MIN_IMAGES_FOR_INTERVAL`` on."""
 
     value: float
     low: float | None
@@ -47,7 +48,7 @@ class Mean:
     count: int
 
     def cell(self, digits: int = 3, sign: str = "") -> str:
-        """The mean with its interval where it has one; a dash for the mean of nothing."""
+        """Format the mean with its interval, if any; a dash for no values."""
         if self.count == 0:
             return "-"
         value, low, high = (f"{n or 0.0:{sign}.{digits}f}" for n in (self.value, self.low, self.high))
@@ -55,10 +56,10 @@ class Mean:
 
 
 def mean_with_interval(values: Iterable[float | None]) -> Mean:
-    """Mean of the numbers that there are, with a seeded 95 % percentile-bootstrap interval."""
+    """Return the mean of the available numbers, with a seeded 95 % percentile-bootstrap interval."""
     data = np.array([value for value in values if value is not None], np.float64)
     mean = float(data.mean()) if data.size else float("nan")
-    if data.size < FEWEST_FOR_INTERVAL:
+    if data.size < MIN_IMAGES_FOR_INTERVAL:
         return Mean(mean, None, None, data.size)
     picks = np.random.default_rng(0).integers(0, data.size, (2000, data.size))
     low, high = np.quantile(data[picks].mean(axis=1), [0.025, 0.975])
@@ -66,24 +67,24 @@ def mean_with_interval(values: Iterable[float | None]) -> Mean:
 
 
 def paired_difference(first: Mapping[str, float], second: Mapping[str, float]) -> Mean:
-    """Mean of ``first - second`` over the images that both have; an interval without 0 tells them apart."""
+    """Mean of ``first - second`` over common images; significant if the interval excludes 0."""
     return mean_with_interval([first[name] - second[name] for name in first if name in second])
 
 
 def cell(value: float | None, digits: int = 3) -> str:
-    """A number, or a dash for ``None``."""
+    """Format a number, or a dash for ``None``."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def mean_cell(values: Iterable[float | None], digits: int = 3) -> str:
-    """The mean of the numbers that there are, without ``None`` and NaN; a dash where there are none."""
+    """Format the mean of the available numbers, without ``None`` and NaN; a dash if there are none."""
     known = [value for value in values if value is not None and value == value]
     return cell(float(np.mean(known)) if known else None, digits)
 
 
 @dataclass(frozen=True)
 class Table:
-    """Cells as they are printed; ``groups`` are ``(heading, number of columns)`` over the whole header."""
+    """Cells as printed; ``groups`` are ``(heading, number of columns)`` above the whole header."""
 
     title: str
     header: tuple[str, ...]
@@ -92,12 +93,12 @@ class Table:
     groups: tuple[tuple[str, int], ...] = ()
 
     def full_header(self) -> tuple[str, ...]:
-        """Column headings in one line each, with the heading of their group before them."""
+        """Return column headings in one line each, prefixed with their group."""
         groups = [heading for heading, count in self.groups for _ in range(count)] or [""] * len(self.header)
         return tuple(f"{g}: {name}" if g else name for g, name in zip(groups, self.header, strict=True))
 
     def markdown(self) -> str:
-        """A heading, the note and a pipe table; Markdown has one line of headings, so groups go into it."""
+        """Return a heading, the note and a pipe table; group headings are merged into the header line."""
         lines = [f"## {self.title}", "", *([self.note, ""] if self.note else [])]
         cells = [[cell.replace("|", r"\|") for cell in row] for row in (self.full_header(), *self.rows)]
         rows = [f"| {' | '.join(row)} |" for row in cells]
@@ -105,7 +106,7 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def latex(self) -> str:
-        """A ``tabular`` for booktabs, its title as a comment."""
+        """Return a ``tabular`` for booktabs, with its title as a comment."""
         escapes = str.maketrans(_LATEX)
         cells = [[cell.translate(escapes) for cell in row] for row in (self.header, *self.rows)]
         header, *rows = (" & ".join(row) + r" \\" for row in cells)
@@ -116,7 +117,7 @@ class Table:
 
 
 def grouped(records: Iterable[Record], *names: str) -> dict[Any, list[Record]]:
-    """Records by the values of some entries, in the order in which these occur."""
+    """Group records by the values of some entries, in order of occurrence."""
     groups: dict[Any, list[Record]] = {}
     for record in records:
         groups.setdefault(itemgetter(*names)(record), []).append(record)
@@ -126,14 +127,14 @@ def grouped(records: Iterable[Record], *names: str) -> dict[Any, list[Record]]:
 def table_of_groups(
     title: str, records: Iterable[Record], names: Sequence[str], columns: Mapping[str, CellOf], note: str = ""
 ) -> Table:
-    """A row for all values of the entries ``names``, with a cell of its records under each heading."""
+    """Return a table with a row per combination of the entries ``names``, and a cell per heading."""
     groups = grouped(records, *names).values()
     rows = tuple(tuple(cell_of(group) for cell_of in columns.values()) for group in groups)
     return Table(title, tuple(columns), rows, note)
 
 
 def value_at(record: Record, path: str) -> Any:
-    """``capped.raw.abs_rel`` of a record; ``None`` where any part of it is not there."""
+    """Return the value at ``capped.raw.abs_rel`` in a record; ``None`` if any part is missing."""
     value: Any = record
     for name in path.split("."):
         value = (value or {}).get(name)
@@ -141,37 +142,37 @@ def value_at(record: Record, path: str) -> Any:
 
 
 def mean_of(path: str, digits: int = 3, factor: float = 1.0) -> CellOf:
-    """A column: the mean of an entry of the records that have it."""
+    """Column function: the mean of an entry of the records that have it."""
     return lambda rows: mean_cell([factor * v for r in rows if (v := value_at(r, path)) is not None], digits)
 
 
-def most_of(name: str, digits: int = 3) -> CellOf:
-    """A column: the largest value of an entry of the records."""
+def max_of(name: str, digits: int = 3) -> CellOf:
+    """Column function: the maximum of an entry of the records."""
     return lambda group: cell(max(record[name] for record in group), digits)
 
 
 def method_title(group: Sequence[Record]) -> str:
-    """A column: the title of the method."""
+    """Column function: the title of the method."""
     return find_method(group[0]["method"]).title
 
 
 def label_of(record: Record) -> str:
-    """``dataset/sample`` of a record."""
+    """Return ``dataset/sample`` of a record."""
     return f"{record['dataset']}/{record['sample']}"
 
 
 def count_of_pairs(count: int, kind: str = "") -> str:
-    """``"1 pair"``, ``"5 posed pairs"``."""
+    """Format ``"1 pair"``, ``"5 posed pairs"``."""
     return f"{count} {kind}{'pair' if count == 1 else 'pairs'}"
 
 
 def pairs_of(records: Iterable[Record]) -> str:
-    """How many pairs the records are of, in words."""
+    """Format the number of pairs of the records."""
     return count_of_pairs(len({label_of(record) for record in records}))
 
 
 def headline(record: Record) -> float | None:
-    """AbsRel over all pixels with truth: not aligned, or aligned for a method without metres."""
+    """Return AbsRel over all pixels with ground truth: unaligned, or aligned for relative methods."""
     if record["status"] != "ok":
         return None
     both = record["all_pixels"]
@@ -179,7 +180,7 @@ def headline(record: Record) -> float | None:
 
 
 def by_method(records: Sequence[Record], value_of: Callable[[Record], Any]) -> dict[str, dict[str, Any]]:
-    """``method -> label -> value`` over the finished records that have one."""
+    """Return ``method -> label -> value`` over finished records that have a value."""
     values: dict[str, dict[str, Any]] = {}
     for method, group in grouped(records, "method").items():
         known = {label_of(record): value_of(record) for record in group if record["status"] == "ok"}
@@ -188,12 +189,12 @@ def by_method(records: Sequence[Record], value_of: Callable[[Record], Any]) -> d
 
 
 def metric_values(records: Sequence[Record], alignment: str, metric: str) -> Values:
-    """Method -> label -> one metric under the cap, raw or aligned."""
+    """Return method -> label -> one metric under the cap, raw or aligned."""
     return by_method(records, lambda record: value_at(record, f"capped.{alignment}.{metric}"))
 
 
 def groups_of(records: Sequence[Record]) -> dict[str, set[str]]:
-    """Labels of all samples, and of the rectified and the posed ones where both kinds are there."""
+    """Return labels of all samples, and of rectified and posed ones if both occur."""
     kinds = (("rectified ", True), ("posed ", False))
     labels = {name: {label_of(r) for r in records if r.get("rectified") is kind} for name, kind in kinds}
     groups = {"": set().union(*labels.values())} | (labels if all(labels.values()) else {})
@@ -201,14 +202,14 @@ def groups_of(records: Sequence[Record]) -> dict[str, set[str]]:
 
 
 def whole_mean(values: list[float | None], digits: int = 3) -> str:
-    """The mean over pairs, a dash unless every one of them has a number."""
+    """Format the mean over pairs, a dash unless all of them have a value."""
     return mean_cell(() if None in values else values, digits)
 
 
 def per_pair_table(
     title: str, columns: Columns, value_of: ValueOf, digits: int, note: str = "", mean: MeanOf = whole_mean
 ) -> Table:
-    """One row per sample, one column of records each, then the means of every group."""
+    """Return a row per sample, a column per group of records, then the means of each group of samples."""
     header, records_of = zip(*columns, strict=True)
     values = [{label_of(record): value_of(record) for record in column} for column in records_of]
     every = list(chain(*records_of))
@@ -222,7 +223,7 @@ def per_pair_table(
 
 
 def method_columns(records: Sequence[Record]) -> list[tuple[str, list[Record]]]:
-    """Heading and records of each method; without metres it needs an oracle, which the heading says."""
+    """Return heading and records of each method; relative methods are marked as using an oracle."""
     columns = []
     for group in grouped(records, "method").values():
         title, raw = method_title(group), [r["all_pixels"]["raw"] for r in group if r["status"] == "ok"]
@@ -232,7 +233,7 @@ def method_columns(records: Sequence[Record]) -> list[tuple[str, list[Record]]]:
 
 
 def summary_table(records: Sequence[Record], members: Collection[str], title: str) -> Table:
-    """Mean over some samples and its interval of every metric, a row per method as is and one aligned."""
+    """Return mean and interval of all metrics over some samples, a raw and an aligned row per method."""
     scores = [
         {"method": method, "suffix": suffix} | record["capped"][kind]
         for method, group in grouped(records, "method").items()
@@ -252,8 +253,67 @@ def summary_table(records: Sequence[Record], members: Collection[str], title: st
     return table_of_groups(title, scores, ("method", "suffix"), columns, note)
 
 
+def _counted(text: str, count: int, total: int) -> str:
+    """Append how many of ``total`` values a cell is made of, if not all."""
+    return text if count in (0, total) else f"{text} ({count} of {total})"
+
+
+def _mean_and_median(values: Mapping[str, float], members: Collection[str]) -> tuple[str, str]:
+    """Format mean with interval and median over the members that have a value."""
+    known = [values[label] for label in members if label in values]
+    median = cell(float(np.median(known)) if known else None)
+    return _counted(mean_with_interval(known).cell(), len(known), len(members)), median
+
+
+def _percentage(path: str, digits: int) -> CellOf:
+    """Column function: the mean of an entry in per cent, over the records that have it."""
+
+    def cell_of(group: list[Record]) -> str:
+        known = [100 * value for record in group if (value := value_at(record, path)) is not None]
+        return _counted(mean_cell(known, digits), len(known), len(group))
+
+    return cell_of
+
+
+def split_tables(records: Sequence[Record]) -> list[Table]:
+    """Return a table per split with AbsRel of each method; none for a split without records."""
+    shown = []
+    for split, title in TITLES.items():
+        listed = [r for r in records if split_of(r["dataset"], r["sample"]) == split]
+        groups = groups_of(listed)
+        rows = [
+            (find_method(method).title, *chain(*(_mean_and_median(values, m) for m in groups.values())))
+            for method, values in by_method(listed, headline).items()
+        ]
+        headings = (("", 1), *((name, 2) for name in groups))
+        header = ("method", *("mean [95 %]", "median") * len(groups))
+        note = "AbsRel of all pixels with ground truth, without alignment except for relative methods."
+        shown.append(Table(f"{pairs_of(listed)} {title}", header, tuple(rows), note, headings))
+    return [table for table in shown if table.rows]
+
+
+def benchmark_tables(records: Sequence[Record]) -> list[Table]:
+    """Return the metrics of the data sets' own benchmarks, for rectified and for posed pairs."""
+    done = [record for record in records if record["status"] == "ok" and record["all_pixels"]["raw"]]
+    columns: dict[str, CellOf] = {"data set": lambda group: group[0]["dataset"], "method": method_title}
+    columns |= {"pairs": lambda group: str(len(group)), "AbsRel": mean_of("all_pixels.raw.abs_rel")}
+    bad: dict[str, CellOf] = {
+        "bad": lambda group: f"> {group[0]['benchmark']['bad_px']:g} px",
+        "all, %": _percentage("benchmark.all", 2),
+        "noc, %": _percentage("benchmark.noc", 2),
+    }
+    near: dict[str, CellOf] = {"inliers 1.03, %": _percentage("all_pixels.raw.inliers", 1)}
+    rectified = [record for record in done if record.get("benchmark")]
+    posed = [record for record in done if record.get("rectified") is False]
+    by, title = ("dataset", "method"), "Metrics of the data sets' benchmarks"
+    return [
+        table_of_groups(f"{title}, rectified pairs", rectified, by, columns | bad, _BAD_NOTE),
+        table_of_groups(f"{title}, posed pairs", posed, by, columns | near, _NEAR_NOTE),
+    ]
+
+
 def versus_table(records: Sequence[Record], reference: str) -> Table:
-    """Paired differences in AbsRel, all pixels, as ``headline``: the reference minus each other method."""
+    """Return paired differences in AbsRel over all pixels, as ``headline``: reference minus each method."""
     others, rows = by_method(records, headline), []
     values, title = others.pop(reference, {}), find_method(reference).title
     for method, other in others.items():
@@ -262,7 +322,7 @@ def versus_table(records: Sequence[Record], reference: str) -> Table:
             won = f"{sum(values[x] < other[x] for x in values if x in other)} of {difference.count}"
             rows.append((find_method(method).title, str(difference.count), difference.cell(sign="+"), won))
     header = ("method", "pairs", "mean difference [95 %]", "pairs won")
-    note = "Negative: smaller error than the other method. An interval without 0 tells the two apart."
+    note = "Negative: smaller error than the other method. Significant if the interval excludes 0."
     return Table(f"{title} against each other method, AbsRel", header, tuple(rows), note)
 
 
@@ -276,8 +336,19 @@ _BY_REGION = {
 REGIONS = "AbsRel by region and material"
 
 
+_BAD_NOTE = (
+    "Fraction of pixels with a disparity error above the threshold, at the resolution of the files. A hole "
+    "is an error. All: pixels with ground truth. Noc: without pixels that the data set marks as occluded "
+    "(disp_noc, mask0nocc.png, or the right view's disparities). A dash: no file with that information."
+)
+_NEAR_NOTE = (
+    "Metres, without alignment. Inliers: depths within 3 % of the ground truth, as in the Robust Multi-View "
+    "Depth Benchmark."
+)
+
+
 class Details(NamedTuple):
-    """A table of details: how the paths of its numbers in a record begin, a heading each, its note."""
+    """A table of details: prefixes of its values in a record, a heading each, and its note."""
 
     where: str
     headings: dict[str, str]
@@ -291,39 +362,39 @@ DETAILS: dict[str, Details] = {
             **{"visible": "visible", "occluded": "occluded", "out_of_view": "out of view"},
             **{"matched": "matched", "unmatched": "unmatched", "tom": "ToM", "not_tom": "other material"},
         },
-        "Under the cap; aligned for methods that know relative depth only. Visible and occluded are known "
-        "where the data set has a mask, out of view always; matched is where our sweep of both views has a "
-        "match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or mirror "
-        "(classes 2, 3).",
+        "Under the cap; aligned for methods with relative depth only. Visible and occluded need a mask of "
+        "the data set, out of view does not. Matched: our plane sweep of both views has a match with a "
+        "confidence of at least 0.5; the same pixels for every method. ToM: transparent or mirror (classes "
+        "2, 3).",
     ),
     "Disparity, rectified pairs": Details(
         "disparity.",
         _DISPARITY,
-        "Metres turned into disparity at the left image's resolution; shares of pixels for bad-k and D1, "
-        "a dash where the truth's step is coarser than the threshold.",
+        "Metres converted to disparity at the left image's resolution. bad-k and D1 are fractions of "
+        "pixels; a dash if the ground truth is quantized more coarsely than the threshold.",
     ),
     "Disparity by region, rectified pairs": Details(
         "disparity.regions.",
         _BY_REGION,
-        "Visible: neither hidden in the right view nor beside it; edge: within 4 px of a step of the true "
-        "disparity of more than 3 px; flat: the rest.",
+        "Visible: neither occluded in the right view nor outside it; edge: within 4 px of a ground-truth "
+        "disparity step of more than 3 px; flat: the rest.",
     ),
-    "Boundaries, dense truth": Details(
+    "Boundaries, dense ground truth": Details(
         "boundaries.",
         {"f1": "boundary F1", "dbe_acc": "ε acc px", "dbe_comp": "ε comp px"},
-        "F1 as Depth Pro defines it, higher is better; distances of depth boundaries as iBims-1 does.",
+        "Boundary F1 of Depth Pro, higher is better; depth boundary errors of iBims-1.",
     ),
     "AUSE": Details(
         "ause",
         {"": "uncertainty", "_confidence.ause": "confidence", "_confidence.random": "random order"},
-        "Area under the sparsification error of AbsRel; 0 where the least certain pixels are the worst. An "
-        "ensemble of at least 2 has an uncertainty.",
+        "Area under the sparsification error of AbsRel; 0 if the least certain pixels have the largest "
+        "errors. Uncertainty needs an ensemble of at least 2.",
     ),
 }
 
 
 def details_table(records: Sequence[Record], title: str) -> Table:
-    """A row per method with a value: the mean of each quantity over the pairs that have it."""
+    """Return a row per method with a value: the mean of each quantity over pairs that have it."""
     where, headings, note = DETAILS[title]
     done = [record for record in records if record["status"] == "ok"]
     if title == REGIONS:
@@ -338,33 +409,77 @@ def details_table(records: Sequence[Record], title: str) -> Table:
 
 
 def confidence_table(records: Sequence[Record]) -> Table:
-    """What the confidence of each method promises by decile, and what it keeps; pairs weigh the same."""
+    """Compare predicted confidence with observed accuracy by decile; pairs have equal weights."""
     rows = []
     for method, deciles_of in by_method(records, lambda record: record.get("confidence")).items():
         for k, parts in enumerate(zip(*deciles_of.values(), strict=True)):
-            shares = np.array([part["share"] for part in parts])
-            if shares.any():
-                values = [[part[name] or 0.0 for part in parts] for name in ("promised", "kept", "abs_rel")]
-                means = (np.array(values) @ shares) / shares.sum()
+            fractions = np.array([part["fraction"] for part in parts])
+            if fractions.any():
+                values = [
+                    [part[name] or 0.0 for part in parts] for name in ("predicted", "observed", "abs_rel")
+                ]
+                means = (np.array(values) @ fractions) / fractions.sum()
                 name = f"{k / 10:.1f} to {(k + 1) / 10:.1f}"
-                rows.append((find_method(method).title, name, cell(shares.mean()), *map(cell, means)))
-    note = f"Confidence is the probability of a relative error below {RIGHT_WITHIN:g}; pixels of all pairs."
-    header = ("method", "confidence", "share of pixels", "promised", "kept", "AbsRel")
+                rows.append((find_method(method).title, name, cell(fractions.mean()), *map(cell, means)))
+    note = (
+        f"Confidence is the probability of a relative error below {RIGHT_WITHIN:g}, if the calibration is "
+        "correct; pixels of all pairs."
+    )
+    header = ("method", "confidence", "fraction of pixels", "predicted", "observed", "AbsRel")
     return Table("Confidence by decile", header, tuple(rows), note)
 
 
-def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[Table]:
-    """The tables of ``geodiff eval pairs``."""
+#: Coverages in percent of the columns of ``risk_table``.
+COVERAGES = (100, 90, 75, 50, 25)
+
+
+def mean_risk(records: Sequence[Record]) -> dict[str, dict[str, np.ndarray]]:
+    """Return the risk-coverage curves of each method with confidence, averaged over its pairs.
+
+    ``risk`` and ``oracle`` ``(steps,)`` are at coverages from 1 down to 1 / steps.
+    """
+    curves = by_method(records, lambda record: record.get("risk_coverage"))
+    return {
+        method: {
+            name: np.mean([curve[name] for curve in of_pairs.values()], axis=0) for name in ("risk", "oracle")
+        }
+        for method, of_pairs in curves.items()
+        if of_pairs
+    }
+
+
+def risk_table(records: Sequence[Record]) -> Table:
+    """Show the AbsRel of the most confident pixels by coverage; pairs have equal weights."""
+    rows = []
+    for method, curves in mean_risk(records).items():
+        for name, order in (("risk", "confidence"), ("oracle", "error (best possible)")):
+            risk, steps = curves[name], len(curves[name])
+            cells = [cell(risk[steps - round(steps * percent / 100)]) for percent in COVERAGES]
+            area = cell(float(np.mean(risk - curves["oracle"])))
+            rows.append((find_method(method).title, order, *cells, area))
     note = (
-        "All pixels with truth, no cap; metres as they come out, not aligned, except in the columns of "
-        "methods that know relative depth only ('oracle'), which get scale and shift from the truth."
+        "AbsRel of the pixels that remain if only the most confident ones are kept. Confidence is useful if "
+        "it falls towards the right. AUSE is the area between both curves of a method."
+    )
+    header = ("method", "pixels ordered by", *(f"best {percent} %" for percent in COVERAGES), "AUSE")
+    return Table("Risk and coverage", header, tuple(rows), note)
+
+
+def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[Table]:
+    """Return the tables of ``geodiff eval pairs``."""
+    note = (
+        "All pixels with ground truth, no cap; metres without alignment, except for methods with relative "
+        "depth only ('oracle'), which get scale and shift from the ground truth."
     )
     columns = method_columns(records)
     return [
+        *split_tables(records),
         per_pair_table(f"AbsRel of {pairs_of(records)}", columns, headline, 3, note),
         per_pair_table("Seconds", columns, lambda record: record.get("seconds"), 1),
         *([versus_table(records, reference)] if any(r["method"] == reference for r in records) else []),
         *(summary_table(records, labels, f"All metrics, {g}") for g, labels in groups_of(records).items()),
+        *benchmark_tables(records),
         *(details_table(records, title) for title in DETAILS),
         confidence_table(records),
+        risk_table(records),
     ]

@@ -1,4 +1,4 @@
-"""Act 1: clean the photographs of one image, check and refine their poses, match them: ``Evidence``.
+"""Act 1: cleans the images of one scene, checks and refines their poses, and matches them (``Evidence``).
 
 Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
 """
@@ -8,168 +8,153 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 import geodiff_plugin.matching as matching
-from geodiff_plugin._checks import InputError
-from geodiff_plugin._threads import BackgroundTask, leaves_cpu_free, sent_to_cpu
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin._internal.threads import BackgroundTask, leaves_cpu_free
+from geodiff_plugin.cameras import Camera, PosedViews
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
-from geodiff_plugin.matching import Matches, clean
-from geodiff_plugin.matching.matches import read_above
-from geodiff_plugin.matching.rows import RowMatches, RowPictures, match_rows, rectified_pictures
-from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.fit import PoseFit, fit_of_small, measure_fit, posed_greys
-from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.pose.refine import refine_views, report_as_given
-from geodiff_plugin.scale.points import RELIABLE, reliable_matches
-from geodiff_plugin.types import PosedViews
+from geodiff_plugin.evidence.plan import EvidencePlan, RowTasks, fit_in_background
+from geodiff_plugin.evidence.pose_check import CheckedPoses, check_poses, image_facts, used_as_given
+from geodiff_plugin.formats import undistorted
+from geodiff_plugin.matching import clean
+from geodiff_plugin.matching.matches import RELIABLE, read_above
+from geodiff_plugin.matching.repetition import if_repeated, with_repetition
+from geodiff_plugin.matching.rows import rectified_images
+from geodiff_plugin.pose.fit import measure_fit, posed_greys
+from geodiff_plugin.scale.points import reliable_matches
+from geodiff_plugin.trust import FactSheet, MatchesStage, measure
 
 
 def cleaned(images: Sequence[Tensor], config: GuidanceConfig) -> Sequence[Tensor]:
-    """Photographs ``(3, H, W)`` in [0, 1] of native size, without flaws if ``clean_photographs`` is set."""
-    return clean(images, config.sweep_pixels) if config.clean_photographs else images
+    """Remove flaws from images ``(3, H, W)`` in [0, 1] of native size if ``clean_images`` is set."""
+    return clean(images, config.sweep_pixels) if config.clean_images else images
+
+
+def pinhole(image_01: np.ndarray, camera: Camera, config: GuidanceConfig) -> np.ndarray:
+    """Return the image ``(H, W, 3)`` of a camera without its lens distortion."""
+    if camera.lens is None:
+        return image_01
+    # Clean before resampling, which hides the block boundaries of JPEG compression.
+    (ready,) = cleaned([torch.from_numpy(image_01).permute(2, 0, 1)], config)
+    return undistorted(ready.permute(1, 2, 0).contiguous().numpy(), camera)
 
 
 def _with_clean_images(posed: PosedViews, config: GuidanceConfig) -> PosedViews:
-    """The views with clean photographs; the same record if all of them were clean."""
-    images = [posed.left_01, *(view.image_01 for view in posed.views)]
-    left_01, *rights = clear = cleaned(images, config)
+    """Return the views with cleaned images; the same object if all images were clean."""
+    views = [posed.left, *posed.rights]
+    images = [view.image_01 for view in views]
+    clear = cleaned(images, config)
     if all(one is other for one, other in zip(images, clear, strict=True)):
         return posed
-    views = (view._replace(image_01=image) for view, image in zip(posed.views, rights, strict=True))
-    return posed._replace(left_01=left_01, views=tuple(views))
+    left, *rights = (view._replace(image_01=image) for view, image in zip(views, clear, strict=True))
+    return PosedViews(left, tuple(rights))
 
 
-def make_evidence(
-    left_01: Tensor, given: Inputs, config: GuidanceConfig, measured_baseline: bool = False
-) -> Evidence:
-    """Clean the photographs, refine the poses, and prepare the ``Evidence`` of one native left image.
+def plan_evidence(
+    left_01: Tensor,
+    given: Inputs,
+    config: GuidanceConfig,
+    measured_baseline: bool = False,
+    checked: CheckedPoses | None = None,
+) -> EvidencePlan:
+    """Clean the images, refine the poses and prepare the evidence of one left image of native size.
 
-    ``measured_baseline``: a refined pose keeps the distance between the cameras.
+    If ``measured_baseline``, refined poses keep the baseline. ``checked`` are the poses found with an earlier
+    frame of the rig; they are used without another check.
     """
-    checks = bool(given.views) and config.pose != "given"
+    checks = bool(given.views) and config.pose != "given" and checked is None
     if checks and leaves_cpu_free(left_01.device):
-        return _made_during_check(left_01, given, config, measured_baseline)
+        return _matched_during_check(left_01, given, config, measured_baseline)
     posed, points = given.posed_views(left_01), given.points_on(left_01.device)
-    if not posed.views:
+    if not posed.rights:
         return prepare_evidence(posed, points, config)
     posed = _with_clean_images(posed, config)
-    if not checks:
-        report = report_as_given(posed.views)
-    else:
-        views, report = refine_views(posed, measure_fit(posed_greys(posed)), measured_baseline)
-        posed = posed._replace(views=views)
-    return replace(prepare_evidence(posed, points, config), report=BackgroundTask.known(report))
+    poses = used_as_given(posed) if checked is None else checked.of_frame(posed.rights)
+    if checks:
+        greys = posed_greys(posed)
+        poses = check_poses(posed, measure_fit(greys), image_facts(greys), measured_baseline)
+    plan = prepare_evidence(posed._replace(rights=poses.views), points, config)
+    return replace(plan, poses=BackgroundTask.known(poses))
 
 
-def _made_during_check(
+def _matched_during_check(
     left_01: Tensor, given: Inputs, config: GuidanceConfig, measured_baseline: bool
-) -> Evidence:
-    """The same, where the device matches the views while the CPU matches their features.
+) -> EvidencePlan:
+    """Plan the evidence so that the device matches the views while the CPU matches their features.
 
-    That begins before it is known whether the photographs are clean, and again if they were not. As most
-    poses fit, the views are matched as given. Small pictures mostly show that they fit; what else there is to
-    find then changes no view, and act 3 is the first to ask.
+    The views are matched with the poses as given, since most poses fit. Downscaled images usually show that
+    they fit. Any further check then changes no view, and act 3 is the first to need its result.
     """
-    check, evidence = _check_in_background(given.with_left(left_01)), None
+    tasks, plan = fit_in_background(given.with_left(left_01)), None
     posed, points = given.posed_views(left_01), given.points_on(left_01.device)
     clear = _with_clean_images(posed, config)
     if clear is not posed:
-        check = _check_in_background(clear)
-    with suppress(InputError):  # raised again below, unless a refined pose mends it
-        evidence = prepare_evidence(clear, points, config)
-    views = clear.views
-    if check.small.result().surely or check.fit.result().fits:
-        fit = check.fit
-        report = BackgroundTask(
-            lambda: refine_views(clear, fit.result(), measured_baseline).report, left_01.device
-        )
+        tasks = fit_in_background(clear)
+    with suppress(InputError):  # raised again below unless a refined pose resolves it
+        plan = prepare_evidence(clear, points, config)
+
+    def check() -> CheckedPoses:
+        return check_poses(clear, tasks.fit.result(), tasks.images.result(), measured_baseline)
+
+    views = clear.rights
+    if tasks.small.result().surely or tasks.fit.result().fits:
+        poses = BackgroundTask(check, left_01.device)
     else:
-        views, found = refine_views(clear, check.fit.result(), measured_baseline)
-        report = BackgroundTask.known(found)
-    if evidence is None or any(one is not other for one, other in zip(views, clear.views, strict=True)):
-        evidence = prepare_evidence(clear._replace(views=views), points, config)
-    return replace(evidence, report=report)
+        poses = BackgroundTask.known(check())
+        views = poses.result().views
+    if plan is None or any(one is not other for one, other in zip(views, clear.rights, strict=True)):
+        plan = prepare_evidence(clear._replace(rights=views), points, config)
+    return replace(plan, poses=poses)
 
 
-class _Check(NamedTuple):
-    """Whether poses fit, as the CPU works it out."""
+def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> EvidencePlan:
+    """Compute cost volume, matches and points of one image and its right views, all of native size.
 
-    small: BackgroundTask[PoseFit]  # ``fit_of_small``, there first
-    fit: BackgroundTask[PoseFit]
-
-
-def _check_in_background(posed: PosedViews) -> _Check:
-    """The check of views of which the left one, at least, is on the device."""
-    device = posed.left_01.device
-    greys = BackgroundTask(lambda: posed_greys(posed), device)
-    small = BackgroundTask(lambda: fit_of_small(greys.result()), device)
-
-    def fit() -> PoseFit:
-        _ = greys.result().signs  # while another thread looks for features; ``refine_views`` reads them later
-        return measure_fit(greys.result(), small.result)
-
-    return _Check(small, BackgroundTask(fit, device))
-
-
-def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> Evidence:
-    """Cost volume, matches and points of one image and its right views, each of native size."""
+    What the configuration does not need is not computed, and is ``None`` in the evidence.
+    """
     needs_matches = config.needs_matches(points is not None)
     grid = matching.to_grid(native, config.sweep_pixels)
-    volume, matches, known_points, rows = None, None, None, None
-    noticed: list[Message] = []
-    left_out = 0
+    volume, matches, known_points, rows, facts = None, None, None, None, FactSheet()
+    outside = 0
     if points is not None:
-        known_points, left_out = matching.points_to_matches(points, native.K_left, native.size, grid.size)
-    if native.views and (config.search == "volume" or needs_matches):
-        pictures = rectified_pictures(native) if needs_matches and config.crisp else None
+        known_points, outside = matching.points_to_matches(points, native.left.camera, grid.size)
+    if native.rights and (config.search == "volume" or needs_matches):
+        # The rows are sent to the CPU during the sweep, and matched once its matches are known.
+        rgb_images = rectified_images(native) if needs_matches and config.refine_edges else None
+        row_tasks = None if rgb_images is None else RowTasks(rgb_images, native.size)
         volume = matching.build_cost_volume(native, depth_range=config.depth_range, config=config)
         if needs_matches:
-            matches = matching.match_volume(volume)
-            rows = rows_in_background(pictures, matches, known_points)
-        if matching.inverse_pose_preferred(native, matches):
-            noticed.append(INVERSE)
-    if left_out:
-        sentence = f"{left_out} points outside the left image are left out: is their frame right?"
-        noticed.append(Message("points.outside", sentence))
+            matches = with_repetition(matching.match_volume(volume), volume)
+            rows = None if row_tasks is None else row_tasks.match(matches, known_points)
+        facts = measure(MatchesStage(native, matches))
+    # Both synchronize with the device.
+    matches = None if matches is None else if_repeated(matches)
+    reliable = None if matches is None else reliable_matches(matches)
     evidence = Evidence(
         native,
         grid,
         volume,
         matches,
         known_points,
-        reliable=None if matches is None else reliable_matches(matches),
-        rows=rows,
-        noticed=tuple(noticed),
+        reliable=reliable,
+        points_outside=outside,
+        facts=facts,
     )
     _read_back(evidence)
-    return evidence
-
-
-def rows_in_background(
-    pictures: RowPictures | None, matches: Matches, points: Matches | None
-) -> BackgroundTask[RowMatches] | None:
-    """The rows of a rectified pair, matched by the CPU while a GPU goes on: act 3 is the first to ask.
-
-    They are sought up to the nearest of the matches and known points; ``None`` without such a pair.
-    """
-    if pictures is None:
-        return None
-    nearest = matches.inverse_depth.amax()
-    if points is not None:
-        nearest = torch.maximum(nearest, points.inverse_depth.amax())
-    received = sent_to_cpu(nearest)
-    return BackgroundTask(lambda: match_rows(pictures, pictures.shift_px(float(received()))), pictures.device)
+    return EvidencePlan(evidence, rows)
 
 
 def _read_back(evidence: Evidence) -> None:
-    """Fill the caches that wait for the device now, so that no step does."""
+    """Fill the caches that synchronize with the device now, so that no step has to."""
     if evidence.volume is not None:
         _ = evidence.volume.reach_m, evidence.volume.rectified
     if (points := evidence.points) is not None:
-        read_above((points, 0.0), (points, RELIABLE))  # ``reliable_matches`` reads those of matches
+        # ``reliable_matches`` reads the confidence of the matches.
+        read_above((points, 0.0), (points, RELIABLE))

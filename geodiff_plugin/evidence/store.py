@@ -1,37 +1,40 @@
-"""``EvidenceStore``: evidence kept for further calls with the same images, cameras and settings."""
+"""``EvidenceStore``: caches evidence for further calls with the same images, cameras and settings."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import fields
+from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from geodiff_plugin.config import Affects, GuidanceConfig, affected
-from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.inputs import Inputs
-from geodiff_plugin.evidence.prepare import make_evidence
+from geodiff_plugin.evidence.plan import EvidencePlan
+from geodiff_plugin.evidence.pose_check import CheckedPoses
+from geodiff_plugin.evidence.prepare import plan_evidence
+from geodiff_plugin.settings import Affects, names_affecting
 
-#: The settings that evidence is made by; the others count where they decide whether it needs matches.
-_OF_EVIDENCE = [field.name for field in fields(GuidanceConfig) if affected(field) is Affects.EVIDENCE]
+#: Settings that evidence depends on; others matter only through whether matches are needed.
+_OF_EVIDENCE = names_affecting(GuidanceConfig, Affects.EVIDENCE)
 
 
 class _Entry(NamedTuple):
-    """Evidence, what it was made from, and how long that took."""
+    """Evidence, the data it was made from, and the seconds that took."""
 
     tensors: list[Tensor | None]
     settings: tuple[Any, ...]
-    evidence: Evidence
+    checked: CheckedPoses | None
+    plan: EvidencePlan
     seconds: float
 
 
 class EvidenceStore:
-    """A cache of evidence by the values that it was made from; several guidances may share it."""
+    """A cache of evidence, keyed by the values it was made from; several guidances may share it."""
 
     def __init__(self, size: int = 2, copies: bool = True) -> None:
-        """Keep the last ``size`` images, some 100 MB each; without ``copies`` they must not be changed."""
+        """Keep the last ``size`` images, about 100 MB each; without ``copies`` they must not be modified."""
         self._size, self._copies, self._spared = size, copies, 0.0
         self._entries: list[_Entry] = []
 
@@ -41,28 +44,31 @@ class EvidenceStore:
         given: Inputs,
         config: GuidanceConfig,
         measured_baseline: bool = False,
-    ) -> Evidence:
-        """What ``make_evidence`` gives for these arguments; the caller must not change it."""
-        views = [value for view in given.views for value in view]
-        tensors = [left_01, torch.from_numpy(given.K_left), given.points, *views]
+        checked: CheckedPoses | None = None,
+    ) -> EvidencePlan:
+        """Return the result of ``plan_evidence`` for these arguments; the caller must not modify it."""
+        of_views = [(view.camera.K, view.T_right_from_left) for view in given.views]
+        cameras = [torch.from_numpy(each) for each in (given.left.K, *chain(*of_views))]
+        masks = [given.valid, *(view.valid for view in given.views)]
+        tensors = [left_01, given.points, *(view.image_01 for view in given.views), *cameras, *masks]
         needs_matches = config.needs_matches(given.points is not None)
         settings = tuple(getattr(config, name) for name in _OF_EVIDENCE)
         settings = (*settings, needs_matches, measured_baseline, given.unit)
         for entry in self._entries:
-            comparable = entry.settings == settings and len(entry.tensors) == len(tensors)
-            if comparable and all(map(_equal, entry.tensors, tensors)):
+            same = entry.settings == settings and entry.checked is checked
+            if same and len(entry.tensors) == len(tensors) and all(map(_equal, entry.tensors, tensors)):
                 self._spared += entry.seconds
-                return entry.evidence
+                return entry.plan
         start = time.perf_counter()
-        evidence = make_evidence(left_01, given, config, measured_baseline)
-        # Copies, so that an image that was changed in place since is not taken for the same.
+        plan = plan_evidence(left_01, given, config, measured_baseline, checked)
+        # Copies detect an image that was modified in place since.
         held = [value.clone() if self._copies and value is not None else value for value in tensors]
-        self._entries.insert(0, _Entry(held, settings, evidence, time.perf_counter() - start))
+        self._entries.insert(0, _Entry(held, settings, checked, plan, time.perf_counter() - start))
         del self._entries[self._size :]
-        return evidence
+        return plan
 
     def take_spared_seconds(self) -> float:
-        """Seconds that the cache saved since the last call of this method; benchmarks add them."""
+        """Return the seconds saved by the cache since the last call of this method, for benchmarks."""
         spared, self._spared = self._spared, 0.0
         return spared
 

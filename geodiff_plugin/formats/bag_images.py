@@ -1,7 +1,7 @@
-"""Images of bags in the encodings of ``sensor_msgs/image_encodings.hpp`` and of camera drivers.
+"""Decodes images of bags in the encodings of ``sensor_msgs/image_encodings.hpp`` and camera drivers.
 
-``rosbags-image`` is not used: it ignores ``step``, so that padded rows shear, and takes NV12 to be as high as
-its image.
+``rosbags-image`` is not used: it ignores ``step``, so padded rows shear, and assumes that NV12 data is as
+high as its image.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from geodiff_plugin._checks import InputFileError, bad_value, warn
-from geodiff_plugin.messages import Message
+from geodiff_plugin._internal.checks import InputFileError, bad_value, warn
+from geodiff_plugin.findings import Finding
 
-#: Bits of a camera, at least and at most, whose numbers may lie in 16 bits as they come.
+#: Numbers of bits of sensors whose values may be stored unscaled in 16 bits.
 SENSOR_BITS = (10, 12, 14)
-#: Types of messages with coded videos, and what makes pictures of them.
+#: Message types of compressed videos, and programs that decode them.
 CODED = (
     "FFMPEGPacket",
     "CompressedVideo",
@@ -31,9 +31,9 @@ DECODE_CODED = "Republish them as raw images and record those: ros2 run image_tr
 
 @dataclass(frozen=True)
 class Encoding:
-    """An encoding of raw images: type of its numbers, how many a pixel, OpenCV's code that makes RGB of it.
+    """An encoding of raw images: type of its values, channels, and OpenCV's conversion code to RGB.
 
-    ``rows`` are those of the data for each of the image: half as many again hold the colours of NV12.
+    ``rows`` is data rows per image row: NV12 has half as many again for the colours.
     """
 
     kind: str
@@ -56,7 +56,7 @@ def _encodings() -> dict[str, Encoding]:
     for bits in (8, 16):
         kind = f"u{bits // 8}"
         table |= {f"rgb{bits}": Encoding(kind, 3, None), f"rgba{bits}": Encoding(kind, 4, cv2.COLOR_RGBA2RGB)}
-        # OpenCV's own types say nothing of colours; its images are BGR.
+        # OpenCV's own types do not state colours; its images are BGR.
         table |= dict.fromkeys((f"bgr{bits}", f"{bits}UC3"), Encoding(kind, 3, cv2.COLOR_BGR2RGB))
         table |= dict.fromkeys((f"bgra{bits}", f"{bits}UC4"), Encoding(kind, 4, cv2.COLOR_BGRA2RGB))
         table |= dict.fromkeys((f"mono{bits}", f"{bits}UC1"), Encoding(kind, 1, cv2.COLOR_GRAY2RGB))
@@ -66,20 +66,20 @@ def _encodings() -> dict[str, Encoding]:
     return table
 
 
-#: By the name that a message has, whose letters may be large or small.
+#: Encodings by name in a message, in any letter case.
 ENCODINGS = _encodings()
 
 
 def decode_image(message: Any, path: Path) -> np.ndarray:
-    """``(H, W, 3)``, RGB, in its own type, of an ``Image`` or a ``CompressedImage``."""
+    """Return an ``Image`` or ``CompressedImage`` as ``(H, W, 3)``, RGB, in its own dtype."""
     data = np.asarray(message.data, dtype=np.uint8)
     if hasattr(message, "format"):
         image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
         if image is None:
-            cure = (
+            hint = (
                 DECODE_CODED if any(word in message.format.lower() for word in ("264", "265", "hevc")) else ""
             )
-            raise InputFileError(f"an image of {path} ({message.format}) does not decode. {cure}".rstrip())
+            raise InputFileError(f"an image of {path} ({message.format}) cannot be decoded. {hint}".rstrip())
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     by_small = {name.lower(): encoding for name, encoding in ENCODINGS.items()}
     encoding = by_small.get(str(message.encoding).lower())
@@ -89,9 +89,12 @@ def decode_image(message: Any, path: Path) -> np.ndarray:
     height = round(message.height * encoding.rows)
     used = message.width * encoding.channels * numbers.itemsize
     if message.step < used or data.size < height * message.step:
-        expected = f"of {height} rows of {used} bytes ({message.encoding})"
+        expected = f"{height} rows of {used} bytes ({message.encoding})"
         bad_value(
-            "an image", expected, f"{data.size} bytes, rows of {message.step}, in {path}", "Is it cut off?"
+            "an image",
+            expected,
+            f"{data.size} bytes, rows of {message.step}, in {path}",
+            "It may be truncated.",
         )
     rows = data[: height * message.step].reshape(height, message.step)[:, :used]
     image = np.ascontiguousarray(rows).view(numbers).astype(encoding.kind)
@@ -100,18 +103,18 @@ def decode_image(message: Any, path: Path) -> np.ndarray:
 
 
 def both_as_01(images: Sequence[np.ndarray], path: Path) -> list[np.ndarray]:
-    """Images of one moment as float32 in [0, 1], both by the bits that the brighter one needs."""
-    most = max(float(image.max()) for image in images)
+    """Convert images of one moment to float32 in [0, 1], with the bit depth that the brighter one needs."""
+    maximum = max(float(image.max()) for image in images)
     if images[0].dtype.kind == "f":
-        full = 1.0 if most <= 1.0 else 255.0
-        if not all(np.isfinite(image).all() and image.min() >= 0 for image in images) or most > full:
-            bad_value("an image of floats", "of values from 0 to 1, or to 255", f"up to {most:g} in {path}")
+        full = 1.0 if maximum <= 1.0 else 255.0
+        if not all(np.isfinite(image).all() and image.min() >= 0 for image in images) or maximum > full:
+            bad_value("an image of floats", "in [0, 1] or [0, 255]", f"up to {maximum:g} in {path}")
     elif images[0].dtype == np.uint16:
-        bits = next((bits for bits in SENSOR_BITS if most < 1 << bits), 16)
+        bits = next((bits for bits in SENSOR_BITS if maximum < 1 << bits), 16)
         full = float((1 << bits) - 1)
         if bits < 16:
-            sentence = f"Its 16-bit images reach {most:.0f}: they are taken to be of {bits} bits."
-            warn(Message("image.bits", f"{path.name}: {sentence}"), stacklevel=3)
+            sentence = f"Its 16-bit images have a maximum of {maximum:.0f}, so {bits} bits are assumed."
+            warn(Finding("image.bits", f"{path.name}: {sentence}"), stacklevel=3)
     else:
         full = float(np.iinfo(images[0].dtype).max)
     return [image.astype(np.float32) / np.float32(full) for image in images]

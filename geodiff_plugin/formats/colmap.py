@@ -1,7 +1,7 @@
-"""COLMAP's models, read as captures and as calibrations, and written (S5.1).
+"""Reads COLMAP models as captures and calibrations, and writes them (S5.1).
 
-pycolmap reads a whole model or none; here a camera or an image that cannot be used leaves out its frames. Of
-pycolmap are the lens models that OpenCV does not have (``lenses``).
+pycolmap reads a whole model or nothing; here an invalid camera or image only excludes its frames. pycolmap is
+used for lens models that OpenCV lacks (``lenses``).
 
 Source: ``scene/reconstruction_io_text.cc``, ``scene/reconstruction_io_binary.cc`` and ``sensor/models.h`` of
 colmap/colmap.
@@ -13,37 +13,37 @@ import os
 import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError, MissingFileError, bad_value
+from geodiff_plugin._internal.checks import InputError, MissingFileError, bad_value
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.files import PathLike, check_file, read_text
 from geodiff_plugin.formats.image_files import image_folders
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, posed
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.formats.rigs import (
-    Camera,
     CameraChoice,
+    RawCamera,
     array_of,
     intrinsics,
     make_rig,
     names_of_pair,
     pose_of,
 )
-from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """A camera model: focal lengths before cx cy, its lens as ``Camera.model``, coefficients behind them.
+    """A camera model: focal lengths before cx cy, its lens as ``RawCamera.model``, then coefficients.
 
-    Coefficients that OpenCV's model has more are 0. A panorama has no focal length.
+    Coefficients that only OpenCV's model has are 0. A panorama has no focal length.
     """
 
     focals: int
@@ -51,7 +51,7 @@ class CameraModel:
     behind: int
 
 
-#: In the order of their numbers in binary files, 0 to 17.
+#: Camera models in the order of their numbers in binary files, 0 to 17.
 MODELS = {
     "SIMPLE_PINHOLE": CameraModel(1, "opencv", 0),
     "PINHOLE": CameraModel(2, "opencv", 0),
@@ -72,21 +72,22 @@ MODELS = {
     "EUCM": CameraModel(2, "EUCM", 2),
     "EQUIRECTANGULAR": CameraModel(0, "", 0),
 }
-UNDISTORT = "Undistort the images first (colmap image_undistorter) and give the model that it writes."
-CUT_PANORAMA = "Cut its panoramas into pinhole views first (panorama_sfm.py of pycolmap's examples)."
+UNDISTORT = "Undistort the images first (colmap image_undistorter) and pass the resulting model."
+CUT_PANORAMA = "Convert its panoramas to pinhole views first (panorama_sfm.py in pycolmap's examples)."
 CAMERA = re.compile(r"^[ \t]*(\d+)[ \t]+([A-Z_]+)[ \t]+(\d+)[ \t]+(\d+)[ \t]+(\S.*)$", re.MULTILINE)
-#: Number, quaternion, translation, camera, name. Lines of keypoints have more numbers where the name stands.
+#: Matches number, quaternion, translation, camera, name. Lines of keypoints have further numbers instead of
+#: the name.
 IMAGE = re.compile(
     r"^[ \t]*(\d+)((?:[ \t,]+[-+.\deE]+){7})[ \t,]+(\d+)[ \t,]+(?![-+.\deE]+[ \t,]+\S)(\S.*)$", re.MULTILINE
 )
-#: How COLMAP begins a file of cameras.
+#: First line of a COLMAP file of cameras.
 CAMERAS_MARK = "# Camera list with"
-#: How it begins a file of images.
+#: First line of a COLMAP file of images.
 IMAGES_MARK = "# Image list with"
 _ANY_CAMERA = rf"^[ \t]*\d+[ \t]+(?:{'|'.join(MODELS)})[ \t]+\d+[ \t]+\d+[ \t]+\S"
 MARK = rf"{CAMERAS_MARK}|{IMAGES_MARK}|{_ANY_CAMERA}|{IMAGE.pattern}"
-LONGEST_HEAD = 200
-#: Where a project has its models, below its folder; of several in one place the largest is taken.
+MAX_HEADER_CHARS = 200
+#: Subfolders of a project with models; among several in one folder the largest is used.
 PLACES = (
     ("",),
     ("sparse/*", "sparse"),
@@ -96,19 +97,19 @@ PLACES = (
     ("dense/sparse", "dense/*/sparse"),
     ("distorted/sparse/*",),
 )
-#: Files of a model's cameras and images, text before binary.
+#: Files with a model's cameras and images, text before binary.
 Files = tuple[Path, Path]
-#: A start for other programs: text of a million points is 50 MB.
-MOST_POINTS = 100_000
-#: Points that fewer images see are no known depths.
-FEWEST_VIEWS = 3
-#: Nor are points that lie further off in the images, pixels.
-MOST_ERROR_PX = 1.5
+#: Maximum number of points, as initialisation for other programs: text of a million points is 50 MB.
+MAX_POINTS = 100_000
+#: Minimum number of images that observe a point used as known depth.
+MIN_VIEWS = 3
+#: Maximum reprojection error in pixels of a point used as known depth.
+MAX_ERROR_PX = 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image of a model: its number, quaternion and translation as text, its camera's number."""
+    """An image of a model: number, quaternion and translation as text, and number of its camera."""
 
     number: int
     words: str
@@ -116,21 +117,21 @@ class PosedImage:
 
     @property
     def T(self) -> np.ndarray:
-        """``(4, 4)`` T_camera_from_world; an error where the numbers are none of a pose."""
+        """Return ``(4, 4)`` T_camera_from_world; raise if the numbers are not a pose."""
         qw, qx, qy, qz, *place = array_of(self.words.replace(",", " ").split(), (7,), f"image {self.number}")
-        return pose_of(Rotation.from_quat([qx, qy, qz, qw]), place)  # refuses zeros
+        return pose_of(Rotation.from_quat([qx, qy, qz, qw]), place)  # raises for zeros
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Cameras of a model by number, those that cannot be used with the reason, and images by name."""
+    """Cameras of a model by number (unusable ones with the reason), and images by name."""
 
-    cameras: dict[int, Camera]
+    cameras: dict[int, RawCamera]
     unusable: dict[int, str]
     images: dict[str, PosedImage]
 
-    def camera(self, number: int) -> Camera:
-        """The camera of a number; ``InputError`` with the reason where it cannot be used."""
+    def camera(self, number: int) -> RawCamera:
+        """Return a camera by number; raise ``InputError`` with the reason if it is unusable."""
         if number in self.unusable:
             raise InputError(self.unusable[number])
         if number not in self.cameras:
@@ -140,7 +141,7 @@ class Model:
 
 
 def model_files(folder: Path) -> Files | None:
-    """The files of a model's cameras and images, text before binary; ``None`` where a folder has none."""
+    """Return the files of a model's cameras and images, text before binary; ``None`` if there are none."""
     for suffix in (".txt", ".bin"):
         files = folder / f"cameras{suffix}", folder / f"images{suffix}"
         if all(file.is_file() for file in files):
@@ -149,24 +150,24 @@ def model_files(folder: Path) -> Files | None:
 
 
 def calibration_text(path: PathLike) -> str:
-    """The text of a calibration file, of a COLMAP model without its points."""
+    """Read a calibration file; for a COLMAP model without its points."""
     path = check_file(path, "calibration", "a calibration file")
     if path.name == "cameras.bin":
         return "\n".join([CAMERAS_MARK, *_binary_cameras(path)])
     if path.name == "images.bin":
         return "\n".join([IMAGES_MARK, *_binary_images(path)])
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        head = file.readline(LONGEST_HEAD)
-        if head.startswith(IMAGES_MARK) or path.name == "images.txt":  # which may exceed what a text may be
+        head = file.readline(MAX_HEADER_CHARS)
+        if head.startswith(IMAGES_MARK) or path.name == "images.txt":  # may exceed the size limit of texts
             lines = [line for line in (head, *file) if IMAGE.match(line)]
             if not lines:
-                bad_value("calibration", "images.txt of a COLMAP model", f"{path} without a line of an image")
+                bad_value("calibration", "images.txt of a COLMAP model", f"{path} without images")
             return "\n".join([IMAGES_MARK, *lines])
     return read_text(path, "calibration", "a calibration file")
 
 
 class _Bytes:
-    """Reads little-endian numbers of a file, one group after the other; ``"z"`` is a text up to a zero."""
+    """Reads groups of little-endian numbers of a file; ``"z"`` is a zero-terminated text."""
 
     def __init__(self, path: Path) -> None:
         self._data, self._at, self._path = path.read_bytes(), 0, path
@@ -177,7 +178,7 @@ class _Bytes:
         try:
             numbers = struct.unpack_from(f"<{layout}", self._data, self._at)
         except struct.error:
-            bad_value(f"{self._path}", "a binary COLMAP file", "less than it says it holds", "Is it cut off?")
+            bad_value(f"{self._path}", "a binary COLMAP file", "too few bytes", "It may be truncated.")
         self._at += struct.calcsize(f"<{layout}")
         return numbers
 
@@ -186,7 +187,7 @@ def _binary_cameras(path: Path) -> Iterator[str]:
     take = _Bytes(path)
     for _ in range(*take("Q")):
         number, model, width, height = take("IiQQ")
-        if not 0 <= model < len(MODELS):  # how many parameters follow is not known
+        if not 0 <= model < len(MODELS):  # the number of parameters that follow is unknown
             expected = f"with camera models 0 to {len(MODELS) - 1} of COLMAP"
             bad_value(f"{path}", expected, model, "Convert it to text: colmap model_converter.")
         name, form = list(MODELS.items())[model]
@@ -203,21 +204,21 @@ def _binary_images(path: Path) -> Iterator[str]:
         yield f"{number} {' '.join(map(repr, pose))} {camera} {name.decode(errors='replace')}"
 
 
-def model_camera(number: str, name: str, size: tuple[int, int], words: str) -> Camera:
-    """The camera of a model's name, its ``(width, height)``, and its parameters as text."""
+def model_camera(number: str, name: str, size: tuple[int, int], words: str) -> RawCamera:
+    """Return the camera of a model name, ``(width, height)``, and parameters as text."""
     if name not in MODELS:
         bad_value(f"the model of camera {number}", f"one of {', '.join(MODELS)}", name, UNDISTORT)
     form = MODELS[name]
     if not form.focals:
-        bad_value(f"the model of camera {number}", "one with a focal length", name, CUT_PANORAMA)
+        bad_value(f"the model of camera {number}", "a model with a focal length", name, CUT_PANORAMA)
     expected = (form.focals + 2 + form.behind,)
     numbers = array_of(words.split(), expected, f"parameters of camera {number}")
-    # COLMAP puts the centre of the first pixel at (0.5, 0.5).
+    # COLMAP's first pixel has its centre at (0.5, 0.5).
     cx, cy = numbers[form.focals : form.focals + 2] - 0.5
     coefficients = numbers[form.focals + 2 :]
     if form.lens in ("opencv", "fisheye"):
         coefficients = np.pad(coefficients, (0, max(4 - form.behind, 0)))
-    return Camera(intrinsics(numbers[0], numbers[form.focals - 1], cx, cy), size, coefficients, form.lens)
+    return RawCamera(intrinsics(numbers[0], numbers[form.focals - 1], cx, cy), size, coefficients, form.lens)
 
 
 def _images(text: str) -> dict[str, PosedImage]:
@@ -228,7 +229,7 @@ def _images(text: str) -> dict[str, PosedImage]:
 
 
 def _model(cameras_text: str, images_text: str) -> Model:
-    cameras, unusable = dict[int, Camera](), dict[int, str]()
+    cameras, unusable = dict[int, RawCamera](), dict[int, str]()
     for number, name, width, height, words in CAMERA.findall(cameras_text):
         try:
             cameras[int(number)] = model_camera(number, name, (int(width), int(height)), words)
@@ -238,25 +239,25 @@ def _model(cameras_text: str, images_text: str) -> Model:
 
 
 def read_model(files: Files) -> Model:
-    """The model of its files of cameras and images."""
+    """Read the model of these files of cameras and images."""
     return _model(*map(calibration_text, files))
 
 
 class _SeenPoint(NamedTuple):
-    """A point of a model, as its file has it."""
+    """A point of a model as in its file."""
 
     xyz: Sequence[Any]
     error_px: Any
-    images: Sequence[Any]  # numbers of those that see it
+    images: Sequence[Any]  # numbers of the images that observe it
 
 
 def read_points(folder: Path) -> dict[int, np.ndarray]:
-    """The reliable points ``(n, 3)`` that an image of a model sees, by its number, in the model's world."""
+    """Return the reliable points ``(n, 3)`` observed by each image, by number, in the model's world frame."""
     path = folder / "points3D.txt"
     rows = _text_points(path) if path.exists() else _binary_points(path.with_suffix(".bin"))
     seen: dict[int, list[Sequence[Any]]] = {}
     for point in rows:
-        if len(point.images) >= FEWEST_VIEWS and float(point.error_px) <= MOST_ERROR_PX:
+        if len(point.images) >= MIN_VIEWS and float(point.error_px) <= MAX_ERROR_PX:
             for image in set(point.images):
                 seen.setdefault(int(image), []).append(point.xyz)
     return {image: array_of(points, (-1, 3), f"points of {path}") for image, points in seen.items()}
@@ -278,7 +279,7 @@ def _binary_points(path: Path) -> Iterator[_SeenPoint]:
 
 
 def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The two images of ``choice.image_names``, both files in any order, in the model's unit."""
+    """Return the rig of ``choice.image_names``; files in any order, lengths in the model's unit."""
     by_kind = {CAMERA.search(text) is not None and IMAGES_MARK not in text: text for text in texts}
     if len(by_kind) != 2:
         bad_value("the files", "cameras.txt and images.txt", "two of one kind")
@@ -289,7 +290,7 @@ def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 
 def _models_below(path: Path) -> Iterator[list[Files]]:
-    """The models of each of ``PLACES`` that has any."""
+    """Yield the models of each of ``PLACES`` that has any."""
     if path.is_file():
         if path.stem in ("cameras", "images") and (files := model_files(path.parent)):
             yield [files]
@@ -304,15 +305,15 @@ def _models_below(path: Path) -> Iterator[list[Files]]:
 
 
 class _Chosen(NamedTuple):
-    """The model that is read, of those of one place."""
+    """The selected model, among those in one folder."""
 
     files: Files
     model: Model
-    notes: tuple[Message, ...] = ()  # on the others
+    findings: tuple[Finding, ...] = ()  # about the other models
 
 
 def _largest(models: Iterable[Files], project: Path) -> _Chosen:
-    """The model with most images, the first of several."""
+    """Return the model with most images, the first if equal."""
     read = [(files, read_model(files)) for files in models]
     files, model = max(read, key=lambda each: len(each[1].images))
     others = [
@@ -322,14 +323,14 @@ def _largest(models: Iterable[Files], project: Path) -> _Chosen:
     ]
     if not others:
         return _Chosen(files, model)
-    said = f"{files[0].parent.relative_to(project)}, with {len(model.images)} images, is used"
-    note = f"{said}, the largest of {len(read)} models; left out: {', '.join(others)}."
-    notes = (Message("capture.part", f"{note} To take another, give its folder."),)
-    return _Chosen(files, model, notes)
+    text = f"{files[0].parent.relative_to(project)}, with {len(model.images)} images, is used"
+    finding = f"{text}, the largest of {len(read)} models; ignored: {', '.join(others)}."
+    findings = (Finding("capture.part", f"{finding} To use another, pass its folder."),)
+    return _Chosen(files, model, findings)
 
 
 def _around(folder: Path, project: Path) -> list[Path]:
-    """The folder of a model and those above it, up to its project, where images may lie."""
+    """Return the folder of a model and its parents up to the project, which may contain images."""
     folder, project = folder.absolute(), project.absolute()
     above = [folder, *folder.parents][:4]
     inside = folder != project and folder.is_relative_to(project)
@@ -337,9 +338,9 @@ def _around(folder: Path, project: Path) -> list[Path]:
 
 
 def read_colmap_capture(path: Path, images_at: Path | None = None) -> Layout | None:
-    """A model (text or binary), or the project that holds one; its images may be given by their folder.
+    """Read a model (text or binary), or a project that contains one; its image folder may be given.
 
-    That of the first place whose images are there, such as the undistorted ones alone.
+    Uses the model of the first folder whose images exist, which may be undistorted ones only.
     """
     passed_over: list[Layout] = []
     for models in _models_below(path):
@@ -351,8 +352,8 @@ def read_colmap_capture(path: Path, images_at: Path | None = None) -> Layout | N
 
 
 def _capture_of(models: Iterable[Files], path: Path, images_at: Path | None) -> Layout:
-    """The largest of the models of one place."""
-    files, model, notes = _largest(models, path)
+    """Read the largest of the models in one folder."""
+    files, model, findings = _largest(models, path)
     folder = files[0].parent
     try:
         seen = read_points(folder)
@@ -361,15 +362,15 @@ def _capture_of(models: Iterable[Files], path: Path, images_at: Path | None) -> 
     images = Images(sorted(model.images), image_folders(*_around(folder, path)), path, images_at)
 
     def build(frame: CaptureFrame, image: PosedImage) -> Candidate:
-        posed = replace(frame, E=np.linalg.inv(image.T), points=seen.get(image.number))
-        return Candidate(posed, model.camera(image.camera))
+        points = seen.get(image.number)
+        return posed(frame, np.linalg.inv(image.T), model.camera(image.camera), points=points)
 
-    candidates = images.candidates(build, (model.images[name] for name in images.names))
-    return Layout("COLMAP model", None, candidates, as_stored=True, notes=(*notes, *images.notes))
+    entries = (model.images[name] for name in images.names)
+    return images.layout("COLMAP model", entries, build, findings=findings)
 
 
 def check_colmap_names(names: Sequence[str]) -> None:
-    """Refuse names of images that a model cannot hold: those with a blank."""
+    """Raise an error for image names that a model cannot represent because they contain blanks."""
     for name in names:
         if any(letter.isspace() for letter in name):
             bad_value("the name of an image in a COLMAP model", "without blanks", repr(name), "Rename it.")
@@ -381,15 +382,15 @@ def write_colmap(
     cloud: Cloud,
     seen: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> None:
-    """Write a text model into an existing folder, for splatting and MVS; poses are world-to-camera there.
+    """Write a text model into an existing folder, for splatting and MVS; its poses are world-to-camera.
 
     ``views`` has ``(name, K, E, (width, height))`` of every image: no blanks in names, E camera-to-world, the
-    first pixel's centre at (0, 0), which is (0.5, 0.5) in the file. ``seen`` has of every image the pixels
-    ``(n, 2)`` at which it sees points, and their rows ``(n,)`` in the cloud; without it at most 100 000
-    points are written, without tracks. Raises ``ValueError`` for a name with a blank.
+    first pixel's centre at (0, 0), which is (0.5, 0.5) in the file. ``seen`` has, for every image, the pixels
+    ``(n, 2)`` of observed points, and their rows ``(n,)`` in the cloud. Without it at most 100 000 points are
+    written, without tracks. Raises ``ValueError`` for a name with a blank.
     """
     check_colmap_names([name for name, *_ in views])
-    cloud = cloud.thinned(MOST_POINTS) if seen is None else cloud
+    cloud = cloud.thinned(MAX_POINTS) if seen is None else cloud
     seen = [(np.zeros((0, 2)), np.zeros(0, int))] * len(views) if seen is None else seen
     cameras = [f"{CAMERAS_MARK} CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     images = [f"{IMAGES_MARK} IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then POINTS2D[]"]
@@ -404,7 +405,7 @@ def write_colmap(
 
 
 def _image_lines(number: int, name: str, T: np.ndarray, px: np.ndarray, rows: np.ndarray) -> list[str]:
-    """The two lines of an image: its world-to-camera pose ``T (4, 4)``, and the points that it sees."""
+    """Return the two lines of an image: its world-to-camera pose ``T (4, 4)``, and its observed points."""
     qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
     numbers = " ".join(f"{v:.12g}" for v in (qw, qx, qy, qz, *T[:3, 3]))
     each = zip(px + 0.5, rows, strict=True)
@@ -413,7 +414,7 @@ def _image_lines(number: int, name: str, T: np.ndarray, px: np.ndarray, rows: np
 
 
 def _point_lines(cloud: Cloud, rows_of_images: Sequence[np.ndarray]) -> list[str]:
-    """The lines of all points, each with the images that see it and its number among the points of these."""
+    """Return the lines of all points, each with the images that observe it and its index in them."""
     tracks = [""] * len(cloud.points_m)
     for number, rows in enumerate(rows_of_images, 1):
         for index, row in enumerate(rows):

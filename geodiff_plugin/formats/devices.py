@@ -1,4 +1,4 @@
-"""Calibrations that stereo cameras keep: ZED, RealSense, OAK-D."""
+"""Reads calibrations stored in stereo cameras: ZED, RealSense, OAK-D."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin.formats.maps import MM_PER_METRE
 from geodiff_plugin.formats.rigs import (
-    Camera,
     CameraChoice,
+    RawCamera,
     array_of,
     intrinsics,
     make_rig,
@@ -25,13 +26,12 @@ from geodiff_plugin.formats.rigs import (
 )
 from geodiff_plugin.types import Rig
 
-MM_PER_METRE = 1000.0
 CM_PER_METRE = 100.0
 ZED_SIZES = {
     **{"4K": (3840, 2160), "QHDPLUS": (3200, 1800), "2K": (2208, 1242), "FHD1200": (1920, 1200)},
     **{"FHD": (1920, 1080), "HD": (1280, 720), "SVGA": (960, 600), "VGA": (672, 376)},
 }
-#: In OpenCV's order, which is that of its models with 5 and with 8 coefficients.
+#: Coefficients in OpenCV's order, for its models with 5 and with 8 of them.
 ZED_LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 RS_PRINTED = r'^\s*Intrinsic of "'
 RS_INTRINSIC = re.compile(
@@ -40,12 +40,12 @@ RS_INTRINSIC = re.compile(
 RS_EXTRINSIC = re.compile(
     r'^\s*Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)', re.M | re.S
 )
-#: Names of what is not of the infrared pair, in small letters; the depth map is of its left camera.
+#: Matches names outside the infrared pair, in lower case; the depth map belongs to its left camera.
 RS_OTHERS = re.compile(r"colou?r|rgb|depth|gyro|accel|imu|confidence")
-#: What the baseline is called, in metres.
+#: Keys of the baseline in metres.
 RS_BASELINES = ("baseline", "baseline_m", "baseline_meters", "baseline_metres")
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
-#: CAM_B and CAM_C, an OAK-D's left and right camera.
+#: Sockets CAM_B and CAM_C, an OAK-D's left and right camera.
 OAK_PAIR = (1, 2)
 #: Names of depthai's sockets, new and old.
 SOCKETS = {
@@ -57,24 +57,24 @@ Sockets = dict[int, Entries]
 
 
 def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The raw images of ``SN<number>.conf`` at the resolution of ``choice.image_size``; millimetres.
+    """Read the raw images' cameras in ``SN<number>.conf`` for ``choice.image_size``; millimetres.
 
     ``x_right = Rodrigues(RX, CV, RZ) x_left - T``. Source: calibration.hpp of stereolabs/zed-opencv-native.
     """
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     parser.read_string(texts[0])
     sections: dict[str, Entries] = {name: dict(section) for name, section in parser.items()}
-    there = [name for name in ZED_SIZES if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} <= sections.keys()]
-    name = of_size({ZED_SIZES[name]: name for name in there}, choice)
+    available = [name for name in ZED_SIZES if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} <= sections.keys()]
+    name = of_size({ZED_SIZES[name]: name for name in available}, choice)
     cameras = []
     for side in ("LEFT", "RIGHT"):
         section = sections[f"{side}_CAM_{name}"]
         lens = sections.get(f"{side}_DISTO", {}) | section
         keys = ZED_LENS if lens.keys() & set(ZED_LENS[5:]) else ZED_LENS[:5]
         K = intrinsics(*(section[key] for key in ("fx", "fy", "cx", "cy")))
-        cameras.append(Camera(K, ZED_SIZES[name], [lens.get(key, 0.0) for key in keys]))
-    # Keys are small here; per resolution in some files (TY_HD), once for all in others (TY), and not at all
-    # in those of the first cameras.
+        cameras.append(RawCamera(K, ZED_SIZES[name], [lens.get(key, 0.0) for key in keys]))
+    # Keys are lower case here. Some files have them per resolution (TY_HD), others once for all (TY); files
+    # of the first cameras lack them.
     stereo, at = sections["STEREO"], f"_{name.lower()}"
     shift = [stereo["baseline"], *(stereo.get(key + at, stereo.get(key, 0.0)) for key in ("ty", "tz"))]
     turn = array_of([stereo[key + at] for key in ("rx", "cv", "rz")], (3,), "RX, CV, RZ of [STEREO]")
@@ -83,28 +83,28 @@ def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(cameras[0], cameras[1], np.linalg.inv(T))
 
 
-def _rs_camera(values: Entries) -> Camera:
-    """A camera of rs2's entries; a lens of coefficients 0 is none, whatever its model."""
+def _rs_camera(values: Entries) -> RawCamera:
+    """Return a camera of rs2's entries; zero coefficients mean no distortion, for any model."""
     K = intrinsics(*(values[key] for key in ("fx", "fy", "ppx", "ppy")))
     coefficients = array_of(values.get("coeffs", ()), (-1,), "coeffs")
     model = re.sub(r"^.*distortion|[^a-z0-9]", "", str(values.get("model", "none")).lower())
-    model = {"4": "brownconrady", "5": "kannalabrandt4"}.get(model, model)  # the numbers of rs2_distortion
+    model = {"4": "brownconrady", "5": "kannalabrandt4"}.get(model, model)  # numbers of rs2_distortion
     if model != "kannalabrandt4" and not coefficients.any():
         model = "none"
-    return Camera(K, (values["width"], values["height"]), coefficients, model)
+    return RawCamera(K, (values["width"], values["height"]), coefficients, model)
 
 
 class _Pair(NamedTuple):
-    """Two cameras, and what maps points of the left one's frame to the right one's, metres."""
+    """Two cameras, and the transform from the left to the right camera frame, in metres."""
 
-    left: Camera
-    right: Camera
+    left: RawCamera
+    right: RawCamera
     T: np.ndarray  # (4, 4)
 
 
 def _rs_printed(text: str, choice: CameraChoice) -> _Pair:
-    """Of what ``rs-enumerate-devices -c`` prints, which holds every resolution."""
-    cameras: dict[str, dict[tuple[int, int], Camera]] = {"1": {}, "2": {}}
+    """Parse the output of ``rs-enumerate-devices -c``, which contains every resolution."""
+    cameras: dict[str, dict[tuple[int, int], RawCamera]] = {"1": {}, "2": {}}
     for side, block in RS_INTRINSIC.findall(text):
         pairs = (line.partition(":") for line in block.splitlines())
         values: Entries = {key.strip().lower(): value.strip() for key, _, value in pairs}
@@ -117,10 +117,9 @@ def _rs_printed(text: str, choice: CameraChoice) -> _Pair:
 
 
 def _rs_json(text: str) -> _Pair:
-    """Of ``rs2_intrinsics``, left before right, and ``rs2_extrinsics`` between them, under any names.
+    """Parse ``rs2_intrinsics`` (left before right) and ``rs2_extrinsics`` between them, under any names.
 
-    Other cameras are left out where their names say which those of the pair are. Instead of extrinsics there
-    may be a baseline in metres.
+    Ignores other cameras if the names identify the pair. A baseline in metres may replace the extrinsics.
     """
     data = json.loads(text)
     found = list(_rs_objects(data, ""))
@@ -129,22 +128,22 @@ def _rs_json(text: str) -> _Pair:
     baseline = next((data[name] for name in RS_BASELINES if isinstance(data, dict) and name in data), None)
     is_posed = len(between) == 1 or (not between and baseline is not None)
     if len(views) != 2 or not is_posed:
-        expected = "two rs2 intrinsics (fx, fy, ppx, ppy), of the infrared pair, and their extrinsics alone"
-        cure = "Keep those of the infrared pair; their baseline in metres does for the extrinsics."
-        bad_value("the file", expected, f"{len(views)} and {len(between)}", cure)
+        expected = "two rs2 intrinsics (fx, fy, ppx, ppy) of the infrared pair and its extrinsics only"
+        hint = "Keep the entries of the infrared pair; a baseline in metres may replace the extrinsics."
+        bad_value("the file", expected, f"{len(views)} and {len(between)}", hint)
     left, right = map(_rs_camera, views)
     if not between:
         T = transform(np.eye(3), (-array_of(baseline, (), "the baseline"), 0, 0), "the baseline")
         return _Pair(left, right, T)
-    # rs2 keeps a rotation column by column.
+    # rs2 stores rotations column-major.
     R = array_of(between[0]["rotation"], (3, 3), "the rotation of the extrinsics").T
     T = transform(R, between[0]["translation"], "the extrinsics")
-    # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
+    # x decreases from the left to the right camera frame; a transform in the other direction is inverted.
     return _Pair(left, right, T if T[0, 3] <= 0 else np.linalg.inv(T))
 
 
 def _rs_objects(data: Any, name: str) -> Iterator[tuple[str, Entries]]:
-    """Every object of a JSON value, in order, with the names that lead to it."""
+    """Yield every object of a JSON value in order, with the path of names to it."""
     if isinstance(data, dict):
         yield name, data
     pairs = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
@@ -153,36 +152,36 @@ def _rs_objects(data: Any, name: str) -> Iterator[tuple[str, Entries]]:
 
 
 def _of_pair(named: list[tuple[str, Entries]], count: int) -> list[Entries]:
-    """Of more than ``count`` objects those that do not belong to another camera by their names."""
+    """Select objects of the pair if there are more than ``count``, excluding names of other cameras."""
     if len(named) > count:
         named = [(name, values) for name, values in named if not RS_OTHERS.search(name)]
     return [values for _, values in named]
 
 
 def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The infrared pair, whose images the camera rectifies itself, or the T265's fisheyes."""
+    """Read the infrared pair, whose images the camera rectifies, or the T265's fisheyes."""
     printed = re.search(RS_PRINTED, texts[0], re.MULTILINE)
     left, right, T = _rs_printed(texts[0], choice) if printed else _rs_json(texts[0])
     return make_rig(left, right, np.linalg.inv(T), rectified=True)
 
 
 def _socket(value: Any) -> int:
-    """The number of a socket, by which older files call it, of its number or name; -1 for none."""
+    """Return the number of a socket from its number (older files) or name; -1 if unknown."""
     return SOCKETS.get(str(value).upper(), -1) if isinstance(value, str) else int(value)
 
 
-def _oak_camera(cameras: Sockets, socket: int, choice: CameraChoice, with_lens: bool) -> Camera:
-    """The camera, at another resolution of the whole sensor where one is asked for."""
+def _oak_camera(cameras: Sockets, socket: int, choice: CameraChoice, with_lens: bool) -> RawCamera:
+    """Return the camera, optionally at another resolution of the whole sensor."""
     entries = cameras[socket]
     K = array_of(entries["intrinsicMatrix"], (3, 3), f"intrinsicMatrix of socket {socket}")
     lens = (entries["distortionCoeff"], f"cameraType {entries.get('cameraType', 0)}") if with_lens else ()
-    camera = Camera(K, (entries["width"], entries["height"]), *lens)
-    cure = "It is a crop of the sensor: give --fx --fy --cx --cy --baseline of the cropped image."
-    return resized(camera, choice.image_size or camera.size, "the left image", cure)
+    camera = RawCamera(K, (entries["width"], entries["height"]), *lens)
+    hint = "For a crop of the sensor, pass --fx --fy --cx --cy --baseline of the cropped image."
+    return resized(camera, choice.image_size or camera.size, "the left image", hint)
 
 
 def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
-    """For every camera along the links from ``socket``: takes points of ``socket`` to it, in metres."""
+    """Return the transform in metres from ``socket`` to every camera linked to it."""
     reached, T = {socket: np.eye(4)}, np.eye(4)
     while True:
         link, where = cameras[socket]["extrinsics"], f"extrinsics of socket {socket}"
@@ -195,9 +194,9 @@ def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
 
 
 def read_oak(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The cameras as they stand, or, by rectifying rotations, ``StereoDepth``'s, with the right one's K."""
+    """Read the raw cameras, or with rectifying rotations ``StereoDepth``'s, with the right one's K."""
     data = json.loads(texts[0])
-    found = data["cameraData"]  # pairs of a socket and its camera, or an object
+    found = data["cameraData"]  # list of (socket, camera), or an object
     pairs = found.items() if isinstance(found, dict) else found
     cameras: Sockets = {_socket(key): each for key, each in pairs}
     stereo = data.get("stereoRectificationData") or {}
@@ -210,7 +209,7 @@ def read_oak(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     from_left, from_right = _oak_links(cameras, left), _oak_links(cameras, right)
     common = next((socket for socket in from_left if socket in from_right), None)
     if common is None:
-        bad_value("extrinsics", f"a way from socket {left} to {right}", "none", "Calibrate again.")
+        bad_value("extrinsics", f"a chain of links from socket {left} to {right}", "none", "Calibrate again.")
     E = np.linalg.inv(from_left[common]) @ from_right[common]
     if rectified:
         return make_rig(second, second, float(np.linalg.norm(E[:3, 3])), rectified=True)

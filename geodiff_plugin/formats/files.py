@@ -1,4 +1,4 @@
-"""Opens files that the user named, with one-sentence errors: text, arrays, camera matrices and poses."""
+"""Opens user files with concise errors: text, arrays, camera matrices and poses."""
 
 from __future__ import annotations
 
@@ -15,59 +15,77 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 from xml.etree import ElementTree
 
-from geodiff_plugin._checks import InputError, InputFileError, MissingFileError, bad_type, bad_value
+from geodiff_plugin._internal.checks import InputError, InputFileError, MissingFileError, bad_type, bad_value
 
-if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
+if TYPE_CHECKING:  # errors in files are reported before numpy is imported
     import numpy as np
     from PIL import Image
 
 PathLike = str | os.PathLike[str]
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-#: EXIF's tag of how an image is turned or mirrored; from 5 on its sides change places.
+#: EXIF tag of the orientation; values of 5 and above swap width and height.
 ORIENTATION = 0x0112
-#: Its value for an image that is shown as it is stored.
+#: Value of the tag for an image displayed as stored.
 UPRIGHT = 1
-#: Its values that change anything.
-TURNS = range(2, 9)
-#: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
+#: Values of the tag that rotate or mirror the image.
+ORIENTATIONS = range(2, 9)
+#: Matches a number with a decimal comma, between blanks, semicolons or line ends.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
-#: No calibration file is near this size; a larger one is something else.
+#: Maximum size of a calibration file; larger files are of another kind.
 LARGEST_TEXT_BYTES = 16_000_000
 FLAT = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
+#: Number of values of a pose as position and quaternion.
+QUATERNION_POSE_SIZE = 7
+#: Maximum deviation of a quaternion's length from 1: files have few digits.
+UNIT_TOLERANCE = 1e-2
+#: Minimum w of the relative rotation of two views with overlap, which turns by less than 90 degrees.
+MIN_W = 0.7
+#: Matches what Python prints around the numbers of an array of NumPy or PyTorch.
+PRINTED = re.compile(r"(?:\b(?:np|numpy|torch)\.)?\b(?:array|matrix|tensor|asarray)(?=[(])|\b\w+=[^\s)\]]+")
+#: Matches a number of NumPy in a list, as NumPy 2 prints it.
+PRINTED_NUMBER = re.compile(r"\b(?:np\.)?float\d+\(([^()]*)\)")
 MATRIX = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
 
 
+def posix_path(path: PathLike) -> Path:
+    """Return the path of a file, whose folders may be separated by backslashes as on Windows."""
+    file, slashed = Path(path), Path(os.fspath(path).replace("\\", "/"))
+    return slashed if os.path.exists(slashed) and not os.path.exists(file) else file
+
+
 def check_file(path: PathLike, name: str, what: str = "a file") -> Path:
-    """The path of an existing, readable, non-empty file; messages name the argument and what it is."""
+    """Return the path of an existing, readable, non-empty file; raise with ``name`` and ``what``."""
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
     file = Path(path)
     if os.path.isdir(file):
-        bad_value(name, what, f"the folder {path}", "Name the file inside it.", InputFileError)
-    if not os.path.exists(file):  # Path.exists() raises on a name that is too long
-        bad_value(name, what, f"{path}, which does not exist", "Check the spelling.", MissingFileError)
+        bad_value(name, what, f"the folder {path}", "Pass a file in it.", InputFileError)
+    if not os.path.exists(file):  # Path.exists() raises for names that are too long
+        slashed = posix_path(path)
+        hint = "Check the spelling." if slashed == file else f"Write / for \\: {slashed.as_posix()}."
+        bad_value(name, what, f"{path}, which does not exist", hint, MissingFileError)
     if not file.is_file():
-        bad_value(name, what, f"{path}, which is a pipe or a device", "Save what it gives as a file first.")
+        bad_value(name, what, f"{path}, which is a pipe or a device", "Save its output to a file first.")
     if not os.access(file, os.R_OK):
-        bad_value(name, what, f"{path}, which you may not read", "Check its permissions.", InputFileError)
+        bad_value(name, what, f"{path}, which is not readable", "Check its permissions.", InputFileError)
     if file.stat().st_size == 0:
-        bad_value(name, what, f"{path}, which is empty", "Was its download or copy cut off? Fetch it again.")
-    _refuse_stand_in(file, name, what)
+        bad_value(name, what, f"{path}, which is empty", "Download or copy it again.")
+    _raise_placeholder(file, name, what)
     return file
 
 
-def _refuse_stand_in(file: Path, name: str, what: str) -> None:
-    """Refuse what failed downloads leave in the place of a file."""
+def _raise_placeholder(file: Path, name: str, what: str) -> None:
+    """Raise an error for placeholders left by failed downloads."""
     with file.open("rb") as opened:
         head = opened.read(STAND_IN_BYTES).lstrip().lower()
     if head.startswith(b"version https://git-lfs"):
-        bad_value(name, what, f"{file}, a pointer of Git LFS", "Fetch the file itself: git lfs pull.")
+        bad_value(name, what, f"{file}, a Git LFS pointer", "Download the file with: git lfs pull.")
     if head.startswith((b"<!doctype html", b"<html")):
-        cure = "Its download gave an error or a log-in page: fetch it again."
-        bad_value(name, what, f"{file}, a web page", cure)
+        hint = "The download returned an error or login page. Download it again."
+        bad_value(name, what, f"{file}, a web page", hint)
 
 
-#: Bytes by which a web page and a pointer of Git LFS are recognised.
+#: Number of bytes needed to recognise a web page or a Git LFS pointer.
 STAND_IN_BYTES = 64
 MAP_SUFFIXES = (".npy", ".npz", ".pfm", ".png")
 DECODE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError, zlib.error)
@@ -75,7 +93,7 @@ DECODE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError
 
 @contextmanager
 def open_image(path: PathLike, name: str, what: str = "an image file") -> Iterator[Image.Image]:
-    """Open an image file with Pillow, HEIC by pillow-heif; what is none, or damaged, is refused."""
+    """Open an image file with Pillow (HEIC with pillow-heif); raise an error if it is not a whole image."""
     from PIL import Image, UnidentifiedImageError
 
     file = check_file(path, name, what)
@@ -83,29 +101,35 @@ def open_image(path: PathLike, name: str, what: str = "an image file") -> Iterat
         try:
             import pillow_heif
         except ImportError:
-            cure = "Run: pip install pillow-heif (the extra heic), or convert it to PNG or JPEG."
-            bad_value(name, what, f"{file}, which Pillow reads with pillow-heif only", cure)
+            hint = (
+                "Install it with: pip install pillow-heif (extra heic), or convert the file to PNG or JPEG."
+            )
+            bad_value(name, what, f"{file}, which needs pillow-heif", hint, code="image.heic")
         pillow_heif.register_heif_opener()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # what is too large is an error
+            warnings.simplefilter(
+                "ignore", Image.DecompressionBombWarning
+            )  # images that are too large raise an error
             image = Image.open(file)
         with image:
             yield image
     except InputError:
         raise
     except UnidentifiedImageError:
-        bad_value(name, what, f"{file}, a format that Pillow does not read", "Convert it to PNG or JPEG.")
+        hint = "Convert it to PNG or JPEG."
+        bad_value(name, what, f"{file}, a format that Pillow does not read", hint, code="image.unreadable")
     except (Image.DecompressionBombError, *DECODE_ERRORS) as error:
-        cure = "Is it cut off, or too large?"
-        bad_value(name, "a whole image file", f"{file}, which does not decode ({error})", cure)
+        hint = "It may be truncated or too large."
+        got = f"{file}, which cannot be decoded ({error})"
+        bad_value(name, "a whole image file", got, hint, code="image.unreadable")
 
 
 def save_png(image: Image.Image, file: PathLike | IO[bytes]) -> None:
-    """Save a picture as PNG, compressed by zlib's run lengths.
+    """Save an image as PNG, compressed with zlib's run-length strategy.
 
-    Photographs and maps become as small as by zlib's default, in less than half of the time: behind PNG's
-    filters they repeat hardly anything but single bytes. Only drawn patterns become larger.
+    Images and maps become as small as with zlib's default in less than half of the time: after PNG's filters
+    they contain few repetitions other than of single bytes. Only drawn patterns become larger.
     """
     from PIL.Image import RLE
 
@@ -113,27 +137,27 @@ def save_png(image: Image.Image, file: PathLike | IO[bytes]) -> None:
 
 
 def find_map(folder: Path, stem: str) -> Path | None:
-    """The first map of a name in a folder, whatever its suffix; ``None`` where there is none."""
+    """Return the first map with a name in a folder, with any suffix; ``None`` if there is none."""
     paths = (folder / f"{stem}{suffix}" for suffix in MAP_SUFFIXES)
     return next((path for path in paths if path.is_file()), None)
 
 
 def natural_order(path: Path) -> tuple[list[str | int], str]:
-    """Sorts names as people count: f2 before f10."""
-    parts = re.split(r"([0-9]+)", path.stem)  # text and numbers in turns, so that like meets like
+    """Key for sorting names in natural order: f2 before f10."""
+    parts = re.split(r"([0-9]+)", path.stem)  # alternating text and numbers, so that keys are comparable
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
 def stored_size(path: PathLike, name: str) -> tuple[int, int]:
-    """``(width, height)`` of an image file as it stores its pixels."""
+    """Return ``(width, height)`` of an image file as stored."""
     with open_image(path, name) as image:
         return image.size
 
 
 def exif_of(image: Image.Image) -> Image.Exif:
-    """The EXIF data of an opened image, of which no more than needed is decoded.
+    """Return the EXIF data of an opened image, decoding no more than necessary.
 
-    Pillow decodes a PNG for them, because they may lie behind its pixels.
+    Pillow would decode a PNG completely, because EXIF may follow the pixels.
     """
     from PIL import Image
 
@@ -144,8 +168,8 @@ def exif_of(image: Image.Image) -> Image.Exif:
 
 
 def _ends_with_pixels(file: IO[bytes]) -> bool:
-    """Whether a whole PNG file has nothing behind its pixels."""
-    here, kinds = file.tell(), list[bytes]()
+    """Whether a PNG file has no chunks after its pixels."""
+    here, kinds = file.seek(0, os.SEEK_CUR), list[bytes]()
     try:
         file.seek(len(PNG_SIGNATURE))
         while kinds[-1:] != [b"IEND"]:
@@ -153,67 +177,68 @@ def _ends_with_pixels(file: IO[bytes]) -> bool:
             if len(head) < 8:
                 return False
             kinds.append(head[4:])
-            file.seek(int.from_bytes(head[:4], "big") + 4, os.SEEK_CUR)  # its content and its checksum
+            file.seek(int.from_bytes(head[:4], "big") + 4, os.SEEK_CUR)  # content and checksum
     finally:
         file.seek(here)
     return kinds[-2:-1] == [b"IDAT"]
 
 
 def upright_size(path: PathLike, name: str) -> tuple[int, int]:
-    """``(width, height)`` of an image file as it is shown, turned by its EXIF orientation."""
+    """Return ``(width, height)`` of an image file in its EXIF orientation."""
     with open_image(path, name) as image:
         width, height = image.size
-        turned = exif_of(image).get(ORIENTATION, 1) >= 5
-    return (height, width) if turned else (width, height)
+        rotated = exif_of(image).get(ORIENTATION, 1) >= 5
+    return (height, width) if rotated else (width, height)
 
 
-def is_turned(path: PathLike) -> bool:
-    """Whether an image file is shown turned or mirrored, by its EXIF orientation."""
+def is_reoriented(path: PathLike) -> bool:
+    """Whether an image file is rotated or mirrored by its EXIF orientation."""
     with open_image(path, "the image") as image:
-        return exif_of(image).get(ORIENTATION) in TURNS
+        return exif_of(image).get(ORIENTATION) in ORIENTATIONS
 
 
 def read_text(path: PathLike, name: str, what: str = "a text file") -> str:
-    """The text of a file, with Unix line ends and no byte-order mark."""
+    """Read a text file with Unix line ends and without byte-order mark."""
     file = check_file(path, name, what)
-    cure = "Is this an image or an archive?"
+    hint = "Pass a text file, not an image or archive."
     size = file.stat().st_size
     if size > LARGEST_TEXT_BYTES:
-        bad_value(name, what, f"{file} of {size} bytes", cure)
+        bad_value(name, what, f"{file} of {size} bytes", hint)
     raw = file.read_bytes()
-    wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # as Windows' shell and Notepad write
+    wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # written by PowerShell and Notepad
     text = raw.decode("utf-16" if wide else "utf-8-sig", errors="replace")
     if "\0" in text or not text.strip():
-        bad_value(name, what, f"{file}, which holds {'binary data' if text.strip() else 'only blanks'}", cure)
+        bad_value(name, what, f"{file}, which holds {'binary data' if text.strip() else 'only blanks'}", hint)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """The root of an XML text; entities of its own, which may grow without end, are refused."""
+    """Parse XML; raise an error for custom entities, which can expand without limit."""
     if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
         bad_value("the file", "an XML file", "a document type with entities", "Remove it.")
     return ElementTree.fromstring(text.strip())
 
 
 def read_rows(path: PathLike, name: str, what: str) -> list[list[str]]:
-    """The words of every line that has any, without remarks behind ``#`` and ``//``, quotes and separators.
+    """Return the words of all non-empty lines, without comments (``#``, ``//``), quotes and separators.
 
-    Decimal commas are refused: ``1,5 2,5 3,0`` would be six numbers; ``1,2`` alone may be two columns.
+    Raises an error for decimal commas: ``1,5 2,5 3,0`` would be six numbers. ``1,2`` alone may be two
+    columns.
     """
     rows = []
     for line in read_text(path, name, what).replace('"', "").splitlines():
         line = re.split("#|//", line)[0].strip(" \t,;")
         comma = DECIMAL_COMMA.search(line)
         if comma and comma.group() != line:
-            cure = "Write points for commas, as 1.5 for 1,5."
-            bad_value(name, "numbers with a decimal point", f"{path} with {comma.group()}", cure)
+            hint = "Use decimal points, such as 1.5 for 1,5."
+            bad_value(name, "numbers with a decimal point", f"{path} with {comma.group()}", hint)
         if line:
             rows.append(re.split(r"[\s,;]+", line))
     return rows
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of what a file holds, read once as long as its size and time stay the same."""
+    """Return the SHA-256 of a file, cached until its size or modification time changes."""
     state = path.stat()
     return _digest(path.absolute(), state.st_size, state.st_mtime_ns)
 
@@ -225,46 +250,97 @@ def _digest(path: Path, size: int, changed_ns: int) -> str:
 
 
 def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
-    """The array of real numbers of an existing file, in the file's own type; nothing is unpickled."""
+    """Read an array of real numbers in its own dtype; never unpickles."""
     import numpy as np
 
-    cure = "Save one array with numpy.save."
+    hint = "Save one array with numpy.save."
     try:
         value = np.load(path, allow_pickle=False)
-    except Exception as error:  # a damaged head is parsed as Python, which may fail in any way
+    except Exception as error:  # numpy parses a damaged header as Python, which may raise any error
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        if "pickle" in reason:  # numpy's own words, of any other file too, tell how to run what is in there
+        if "pickle" in reason:  # numpy's message suggests allow_pickle, also for other files
             with open(path, "rb") as file:
                 pickled = file.read(1) in (b"\x80", b"\x93")
             reason = "pickled objects, which are never loaded" if pickled else "it is of another format"
-        bad_value(name, expected, f"{path}, which numpy cannot load ({reason})", cure)
+        bad_value(name, expected, f"{path}, which numpy cannot load ({reason})", hint)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-        bad_value(name, expected, f"{path} without an array of real numbers", cure)
+        bad_value(name, expected, f"{path} without an array of real numbers", hint)
     return value
 
 
+def _printed_rows(text: str) -> list[list[str]]:
+    """Return the numbers of an array as Python or NumPy prints it, one row per innermost bracket."""
+    text = PRINTED.sub(" ", PRINTED_NUMBER.sub(r"\1", text))
+    text = re.sub(r"[()]", lambda found: "[]"["()".index(found[0])], text)
+    if re.sub(r"\[[^\[\]]*\]|[\[\]\s]", "", text):  # words, or numbers outside of brackets
+        return [line.split() for line in re.sub(r"[\[\]]", " ", text).splitlines()]
+    return [row.split() for row in re.findall(r"\[([^\[\]]*)\]", text)]
+
+
+def _pose_of_quaternion(values: np.ndarray, path: PathLike, name: str) -> np.ndarray:
+    """Return the ``(4, 4)`` pose of ``tx ty tz qx qy qz qw``, the order of TUM and ROS."""
+    import numpy as np
+
+    x, y, z, w = values[3:]
+    if abs(np.linalg.norm(values[3:]) - 1.0) > UNIT_TOLERANCE or w < MIN_W:
+        hint = (
+            "COLMAP and others write qw first: write the position, then the quaternion with qw last, or a "
+            "4x4 matrix."
+        )
+        expected = "tx ty tz qx qy qz qw, with a unit quaternion that turns by less than 90 degrees"
+        bad_value(name, expected, f"{path} with {' '.join(f'{value:g}' for value in values)}", hint)
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), values[:3]
+    return pose
+
+
+def read_intrinsics(path: PathLike, name: str = "K") -> np.ndarray:
+    """Read K ``(3, 3)`` as ``read_matrix`` does; a projection is named as such."""
+    K = read_matrix(path, name)
+    if K.shape == (4, 4):
+        rows = "; ".join(" ".join(f"{value:g}" for value in row) for row in K[:3, :3])
+        hint = f"If it is a projection P = K [I | t], its first three columns are K: {rows}."
+        if K[0, 1] or abs(K[2, :2]).any() or K[2, 2] != 1 or K[0, 0] <= 1:
+            hint = "If it is a pose, pass it with --E."
+        bad_value(name, "a 3x3 matrix", f"{path} with 3x4 or 4x4 numbers", hint)
+    return K
+
+
 def read_matrix(path: PathLike, name: str = "matrix") -> np.ndarray:
-    """A K ``(3, 3)`` or a pose ``(4, 4)``, float64, from ``.npy`` or text: rows, or all numbers in one."""
+    """Read K ``(3, 3)`` or a pose ``(4, 4)`` as float64 from ``.npy`` or text, in rows or as a flat list.
+
+    Text may be an array as Python or NumPy prints it. Seven numbers are ``tx ty tz qx qy qz qw``.
+    """
     import numpy as np
 
     file = check_file(path, name, MATRIX)
     if file.suffix.lower() == ".npy":
         matrix = read_npy(file, name, MATRIX).astype(np.float64)
     else:
-        rows = [re.sub(r"[\[\]()]", " ", " ".join(row)).split() for row in read_rows(file, name, MATRIX)]
+        lines = [" ".join(row) for row in read_rows(file, name, MATRIX)]
+        has_brackets = any(bracket in line for line in lines for bracket in "[(")
+        rows = _printed_rows("\n".join(lines)) if has_brackets else [line.split() for line in lines]
         try:
             matrix = np.array([row for row in rows if row], dtype=np.float64)
         except ValueError:
-            cure = "Is it cut off? A calibration file with words goes to --calib."
-            bad_value(name, MATRIX, f"{path} with words in it, or rows of several lengths", cure)
+            hint = "It may be truncated. Pass calibration files with --calib."
+            bad_value(name, MATRIX, f"{path} with words in it, or rows of several lengths", hint)
     matrix = np.squeeze(matrix)
     if matrix.ndim == 1 and matrix.size in FLAT:
         matrix = matrix.reshape(FLAT[matrix.size])
+    if matrix.shape == (QUATERNION_POSE_SIZE,):
+        return _pose_of_quaternion(matrix, path, name)
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
     if matrix.shape not in ((3, 3), (4, 4)):
-        cure = "Are these fx fy cx cy? K is three rows: fx 0 cx, 0 fy cy, 0 0 1." if matrix.size == 4 else ""
-        bad_value(name, MATRIX, f"{path} of shape {matrix.shape}", cure)
+        hint = (
+            "If these are fx fy cx cy, write K in three rows: fx 0 cx, 0 fy cy, 0 0 1."
+            if matrix.size == 4
+            else ""
+        )
+        bad_value(name, MATRIX, f"{path} of shape {matrix.shape}", hint)
     if not np.isfinite(matrix).all():
         bad_value(name, "finite", f"NaN or infinity in {path}")
     return matrix

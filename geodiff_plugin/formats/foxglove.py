@@ -1,4 +1,4 @@
-"""MCAP files of Foxglove's protobuf messages, read like a bag by ``mcap-protobuf-support``.
+"""Reads MCAP files with Foxglove's protobuf messages like a bag, using ``mcap-protobuf-support``.
 
 Source: ``RawImage.proto``, ``CompressedImage.proto`` and ``CameraCalibration.proto`` of
 foxglove/foxglove-sdk; the MCAP specification of foxglove/mcap.
@@ -16,27 +16,25 @@ from typing import Any
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value, refuse
+from geodiff_plugin._internal.checks import bad_value, raise_input_error
 
 MAGIC = b"\x89MCAP0\r\n"
-#: An MCAP file says in its head, behind a code and a length, which program's messages it holds.
+#: Header of an MCAP file, after an opcode and a length, which states the profile of its messages.
 HEAD = struct.Struct("<BQI")
-#: Profiles of ROS, whose messages are no protobuf.
+#: Profiles of ROS, whose messages are not protobuf.
 ROS_PROFILES = ("ros1", "ros2")
-#: Foxglove's messages, by what ROS calls the same.
+#: Foxglove's message types by the ROS equivalent.
 MESSAGES = {
     "foxglove.RawImage": "foxglove/Image",
     "foxglove.CompressedImage": "foxglove/CompressedImage",
     "foxglove.CompressedVideo": "foxglove/CompressedVideo",
     "foxglove.CameraCalibration": "foxglove/CameraInfo",
 }
-INSTALL = (
-    "Foxglove's messages are read by mcap-protobuf-support. Run: pip install 'geodiff-plugin[foxglove]'."
-)
+INSTALL = "Foxglove messages need mcap-protobuf-support: pip install 'geodiff-plugin[foxglove]'."
 
 
 def profile_of(path: Path) -> str | None:
-    """The profile in the head of an MCAP file, often empty; ``None`` for another file."""
+    """Return the profile in the header of an MCAP file, often empty; ``None`` for other files."""
     if not path.is_file():
         return None
     with path.open("rb") as file:
@@ -49,16 +47,16 @@ def profile_of(path: Path) -> str | None:
 
 @dataclass(frozen=True)
 class Connection:
-    """A topic of a file, and the type of its messages by ROS' name."""
+    """A topic of a file, with its ROS message type."""
 
     topic: str
     msgtype: str
 
 
 class FoxgloveReader(AbstractContextManager["FoxgloveReader"]):
-    """Protobuf messages of an MCAP file, by the methods of rosbags' ``AnyReader`` that ``recordings`` calls.
+    """Reads protobuf messages of an MCAP file with the interface of rosbags' ``AnyReader``.
 
-    ``deserialize`` returns messages with the names of ROS.
+    ``deserialize`` returns messages with ROS field names.
     """
 
     def __init__(self, path: Path) -> None:
@@ -66,7 +64,7 @@ class FoxgloveReader(AbstractContextManager["FoxgloveReader"]):
             from mcap.reader import make_reader
             from mcap_protobuf.decoder import DecoderFactory
         except ImportError:
-            refuse(INSTALL)
+            raise_input_error(INSTALL)
         self._path, self._make, self._factory = path, make_reader, DecoderFactory()
         self._decoders: dict[str, Any] = {}
         self.connections: list[Connection] = []
@@ -91,9 +89,9 @@ class FoxgloveReader(AbstractContextManager["FoxgloveReader"]):
                 self.connections.append(Connection(channel.topic, MESSAGES.get(schema.name, schema.name)))
         if not self.connections:
             held = sorted({channel.message_encoding for channel in channels.values()})
-            cure = "Write both topics as folders of images, and give those."
+            hint = "Export both topics as folders of images, and pass those."
             got = f"{self._path} of {', '.join(held) or 'nothing'}"
-            bad_value("LEFT", "an MCAP file of messages of ROS 2 or of protobuf", got, cure)
+            bad_value("LEFT", "an MCAP file of messages of ROS 2 or of protobuf", got, hint)
 
     def close(self) -> None:
         """Close the file."""
@@ -109,14 +107,14 @@ class FoxgloveReader(AbstractContextManager["FoxgloveReader"]):
     def messages(
         self, connections: Sequence[Connection], start: int | None = None, stop: int | None = None
     ) -> Iterator[tuple[Connection, int, Any]]:
-        """Connection, time of recording in nanoseconds and message of those before ``stop``, in order."""
+        """Yield connection, recording time in nanoseconds and message before ``stop``, in order."""
         by_topic = {connection.topic: connection for connection in connections}
         found = self._reader.iter_messages(topics=list(by_topic), starting_at=start, ending_before=stop)
         for _, channel, message in found:
             yield by_topic[channel.topic], message.log_time, self._decoders[channel.topic](message.data)
 
     def deserialize(self, message: Any, msgtype: str) -> Any:
-        """An image or a calibration with ROS' names of its entries."""
+        """Return an image or calibration with ROS field names."""
         header = SimpleNamespace(frame_id=message.frame_id)
         if msgtype == MESSAGES["foxglove.CameraCalibration"]:
             matrices = {key: list(getattr(message, key)) for key in "DKRP"}
@@ -134,5 +132,5 @@ class FoxgloveReader(AbstractContextManager["FoxgloveReader"]):
 
     @staticmethod
     def header_ns(message: Any) -> int:
-        """Nanoseconds at which an image was taken."""
+        """Return the capture time of an image in nanoseconds."""
         return int(message.timestamp.seconds) * 1_000_000_000 + int(message.timestamp.nanos)

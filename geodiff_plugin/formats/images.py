@@ -1,134 +1,159 @@
-"""Images from files and memory as floats in [0, 1] (S3.3, the two views), and their EXIF data."""
+"""Reads images from files and memory as floats in [0, 1] (S3.3, the two views), and their EXIF data."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
-from geodiff_plugin._checks import InputError, bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats.files import ORIENTATION, TURNS, UPRIGHT, PathLike, exif_of, open_image
+from geodiff_plugin._internal.camera_checks import check_intrinsics
+from geodiff_plugin._internal.checks import InputError, bad_type, bad_value, check_choice, check_number, warn
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.findings import Finding
+from geodiff_plugin.formats.files import ORIENTATION, ORIENTATIONS, UPRIGHT, PathLike, exif_of, open_image
+from geodiff_plugin.formats.frame_packing import FRAME_LAYOUTS, Packing, find_packing
+from geodiff_plugin.formats.maps import MAX_16_BITS
 from geodiff_plugin.formats.rigs import intrinsics
-from geodiff_plugin.messages import Message
 
-#: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
+#: Minimum side in pixels: smaller images have no matches; also the smallest sensible latent of the VAE.
 MIN_SIDE = 32
-#: Resampling may overshoot [0, 1] by a little; more than this is another range.
+#: Tolerance for values outside [0, 1] due to resampling; larger ones indicate another range.
 OVERSHOOT = 1e-3
-#: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
+#: 16-bit images whose values are all below this come from a camera with 10 or 12 bits.
 DARK_16_BITS = 8192
-#: Formats that hold several frames or pages of one kind; others hold previews.
+#: Formats with several frames or pages of the same kind; others contain previews.
 SEVERAL = ("GIF", "PNG", "TIFF", "WEBP")
 CHANNELS = (1, 3, 4)
-#: What HEIC files call the two pictures of a spatial photograph.
+#: Entity group of the two images in a spatial HEIC file.
 STEREO_GROUP = "ster"
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _DIAGONAL_35_MM = math.hypot(36.0, 24.0)
-#: A focal length further off its EXIF than this factor is of an image of another size: EXIF is known to a few
-#: per cent, and rectification or a lens that was straightened changes it by less.
+#: Maximum ratio between a focal length and its EXIF value; larger ones indicate another image size. EXIF is
+#: accurate to a few per cent, and rectification or undistortion changes it by less.
 _OTHER_LENS = 1.4
-#: Sides may be rounded by this share before an image counts as cropped.
+#: Relative tolerance of the aspect ratio, for rounding; cropping exceeds it.
 _SAME_SHAPE = 0.01
-CURES = "Give K (--K), a field of view (--fov), or photographs with their EXIF."
+HINT = "Pass K (--K), a field of view (--fov), or images with EXIF data."
 
 
 def _check_sides(width: int, height: int, name: str) -> None:
     if min(height, width) < MIN_SIDE:
-        expected = f"at least {MIN_SIDE} pixels a side"
-        bad_value(name, expected, f"{width}x{height}", "Is this a thumbnail or a latent?")
+        expected = f"at least {MIN_SIDE} pixels per side"
+        bad_value(
+            name, expected, f"{width}x{height}", "It may be a thumbnail or a latent.", code="image.small"
+        )
 
 
 def _array_of(image: Image.Image, name: str) -> np.ndarray:
-    """``(H, W)`` floats or uint16, or ``(H, W, C)`` uint8, of an image in any mode that Pillow has."""
+    """Return an image of any Pillow mode as ``(H, W)`` floats or uint16, or ``(H, W, C)`` uint8."""
     _check_sides(*image.size, name)
     if image.mode == "F":
         return np.asarray(image, dtype=np.float32)
-    if image.mode.startswith("I"):  # 16-bit grey: I;16, I;16B, or I in files that Pillow widens
+    if image.mode.startswith("I"):  # 16-bit grey: I;16, I;16B, or I in files that Pillow converts
         grey = np.asarray(image)
-        if grey.min() < 0 or grey.max() > 65535:
+        if grey.min() < 0 or grey.max() > MAX_16_BITS:
             bad_value(name, "an image of 8 or 16 bits", f"values from {grey.min():g} to {grey.max():g}")
         return grey.astype(np.uint16)
-    alpha = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
-    return np.asarray(image.convert("RGBA" if alpha else "RGB"))
+    return np.asarray(image.convert("RGBA" if has_alpha(image) else "RGB"))
 
 
-def _file_notes(image: Image.Image, name: str) -> list[Message]:
-    """What to say of an opened image before its pixels: several frames; few of 16 bits used, in colour."""
-    notes, frames = list[Message](), getattr(image, "n_frames", 1)
+def has_alpha(image: Image.Image) -> bool:
+    """Whether an image has an alpha channel or a transparent colour."""
+    return image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+
+
+def _file_findings(image: Image.Image, name: str) -> list[Finding]:
+    """Return findings on an opened image before decoding: several frames, or 16-bit colour read as 8 bits."""
+    findings, frames = list[Finding](), getattr(image, "n_frames", 1)
     if frames > 1 and image.format in SEVERAL:
-        sentence = f"{name} holds {frames} frames or pages; only the first is taken."
-        notes.append(Message("image.frames", sentence))
-    # Pillow loads the upper 8 bits of these, and tells only before.
+        sentence = f"{name} holds {frames} frames or pages; only the first is used."
+        findings.append(Finding("image.frames", sentence))
+    # Pillow loads only the upper 8 bits of these; the tile information is gone after loading.
     if any(";16" in str(tile[3]) for tile in getattr(image, "tile", ())) and not image.mode.startswith("I"):
-        notes += _dark_notes(257 * int(np.asarray(image.convert("RGB")).max()), name)
-    return notes
+        findings += _dark_findings(257 * int(np.asarray(image.convert("RGB")).max()), name)
+    return findings
 
 
-def _dark_notes(most: int, name: str) -> list[Message]:
-    said = f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535."
-    cure = "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
-    return [Message("image.dark", f"{said} {cure}")] if most < DARK_16_BITS else []
+def _dark_findings(maximum: int, name: str) -> list[Finding]:
+    text = f"{name} is a 16-bit image that is nearly black: its maximum is {maximum} of {MAX_16_BITS}."
+    hint = "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
+    return [Finding("image.dark", f"{text} {hint}")] if maximum < DARK_16_BITS else []
 
 
-def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[Message]]:
-    """``(H, W, 3)`` float32 in [0, 1] of ``(H, W)`` or ``(H, W, C)`` numbers, and what to say of them."""
-    value, notes = value[..., None] if value.ndim == 2 else value, list[Message]()
+def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[Finding]]:
+    """Convert ``(H, W)`` or ``(H, W, C)`` to ``(H, W, 3)`` float32 in [0, 1]; also return findings."""
+    value, findings = value[..., None] if value.ndim == 2 else value, list[Finding]()
     if value.shape[-1] == 4:
         value = value[..., :3]
-        notes.append(Message("image.alpha", f"{name} has an alpha channel; it is dropped."))
+        findings.append(
+            Finding("image.alpha", f"{name} has an alpha channel: pixels with alpha 0 are not valid.")
+        )
     if value.dtype in (np.uint8, np.uint16):
-        notes += _dark_notes(int(value.max()), name) if value.dtype == np.uint16 else []
+        findings += _dark_findings(int(value.max()), name) if value.dtype == np.uint16 else []
         value = value.astype(np.float32) / np.iinfo(value.dtype).max
     elif value.dtype.kind == "f":
         if not np.isfinite(value).all():
             bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
         low, high = float(value.min()), float(value.max())
         if low < -OVERSHOOT or high > 1 + OVERSHOOT:
-            cure = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
-            bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", cure)
+            hint = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."
+            bad_value(name, "floats in [0, 1]", f"values from {low:g} to {high:g}", hint)
         value = value.astype(np.float32, copy=False).clip(0.0, 1.0)
     else:
-        cure = f"Convert it with astype('uint8'){' * 255' if value.dtype == bool else ''}."
-        bad_value(name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", cure)
-    return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value, notes
+        hint = f"Convert it with astype('uint8'){' * 255' if value.dtype == bool else ''}."
+        bad_value(name, "uint8, uint16 or floats in [0, 1]", f"dtype {value.dtype}", hint)
+    return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value, findings
 
 
 def read_image(
     path: PathLike, name: str = "left", *, as_stored: bool = False, page: int = 0
-) -> tuple[np.ndarray, list[Message]]:
-    """An image file, ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it.
+) -> tuple[np.ndarray, list[Finding]]:
+    """Read an image file as ``(H, W, 3)`` float32 in [0, 1], with findings about conversions.
 
-    It is turned upright by its EXIF orientation, unless its camera is one of the pixels ``as_stored``.
-    ``page`` is the number of a picture in a file of several.
+    Applies the EXIF orientation, unless the camera refers to the pixels ``as_stored``. ``page`` is the number
+    of an image in a file of several.
     """
     with open_image(path, name) as image:
-        notes = _file_notes(image, name)
+        findings = _file_findings(image, name)
         image.seek(page)
         image.load()
-        is_turned = image.getexif().get(ORIENTATION) in TURNS and not as_stored
-        upright = ImageOps.exif_transpose(image) if is_turned else image
+        is_reoriented = image.getexif().get(ORIENTATION) in ORIENTATIONS and not as_stored
+        upright = ImageOps.exif_transpose(image) if is_reoriented else image
         pixels = _array_of(upright, name)
     image_01, more = _to_01(pixels, name)
-    notes += more
-    if is_turned:
-        said = f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF says"
-        notes.append(Message("image.turned", f"{said}; a K that you give must belong to the turned image."))
-    return image_01, notes
+    findings += more
+    if is_reoriented:
+        text = f"{name} was rotated or mirrored to {upright.width}x{upright.height} by its EXIF orientation"
+        findings.append(Finding("image.rotated", f"{text}; K must refer to the upright image."))
+    return image_01, findings
 
 
-#: The tag of an MPO file that says of what kind each of its pictures is, and what previews are called there.
+def read_alpha(path: PathLike, name: str, *, as_stored: bool = False) -> np.ndarray | None:
+    """Return the pixels ``(H, W)`` bool of an image file with alpha above 0, rotated like in ``read_image``.
+
+    ``None`` stands for all pixels.
+    """
+    with open_image(path, name) as image:
+        if not has_alpha(image):
+            return None
+        upright = image if as_stored else ImageOps.exif_transpose(image)
+        shown = np.asarray(upright.convert("RGBA"))[..., 3] > 0
+    return None if shown.all() else shown
+
+
+#: Tag with the kinds of the images in an MPO file, and the kinds of previews.
 MPO_ENTRIES = 0xB002
 PREVIEW = "Thumbnail"
 
 
 def pages_of_both(path: PathLike, name: str) -> tuple[int, int]:
-    """Numbers of the left and the right picture in an MPO or a spatial HEIC file.
+    """Return the page numbers of the left and right image in an MPO or spatial HEIC file.
 
     Source: CIPA DC-007, whose stereo images are in order; ISO/IEC 23008-12: the first item of an entity group
     ``ster`` is the left view.
@@ -140,44 +165,46 @@ def pages_of_both(path: PathLike, name: str) -> tuple[int, int]:
         groups = image.info.get("entity_groups") or ()
     if not is_heic:
         if count != 2:
-            bad_value(name, "an MPO file with two pictures, left one first", f"{count} in {path}")
+            bad_value(name, "an MPO file with two images, the left one first", f"{count} in {path}")
         if any(PREVIEW in kind for kind in kinds):
-            got = f"{path} of one view and its preview"
-            bad_value(name, "an MPO file of two views", got, "Give the right view as RIGHT.")
+            got = f"{path} with one view and its preview"
+            bad_value(name, "an MPO file of two views", got, "Pass the right view as RIGHT.")
         return 0, 1
     pair = next((list(group["images"]) for group in groups if group["type"] == STEREO_GROUP), [])
     if len(pair) != 2 or None in pair:
-        cure = "Give the right view as RIGHT. Of a spatial photograph pillow-heif 1.8 or later is needed."
-        expected = "a spatial HEIC file (entity group ster) where RIGHT is missing"
-        bad_value(name, expected, f"{path} with {count} pictures and no such group", cure)
+        hint = "Pass the right view as RIGHT. Spatial HEIC needs pillow-heif 1.8 or later."
+        expected = "a spatial HEIC file (entity group ster) if RIGHT is missing"
+        bad_value(name, expected, f"{path} with {count} images and no such group", hint)
     return int(pair[0]), int(pair[1])
 
 
 def _hwc(value: Any, name: str) -> np.ndarray:
-    """``(H, W, C)``, C of 1, 3 or 4, of an array with channels last or a tensor with channels first."""
+    """Convert an array (channels last) or tensor (channels first) to ``(H, W, C)``, C of 1, 3 or 4."""
     if not isinstance(value, (torch.Tensor, np.ndarray)):
-        bad_type(name, "a PIL image, a numpy array or a torch tensor", value, "Of a file: Image.open(path).")
+        bad_type(
+            name, "a PIL image, a numpy array or a torch tensor", value, "For a file, use Image.open(path)."
+        )
     if isinstance(value, torch.Tensor):
-        channels, shape, turn = 0, "(3, H, W)", "torch images start with channels: value.permute(2, 0, 1)."
+        channels, shape, turn = 0, "(3, H, W)", "For torch, put channels first: value.permute(2, 0, 1)."
     else:
         value = value[..., None] if value.ndim == 2 else value
         channels, shape = -1, "(H, W, 3) or (H, W)"
-        turn = "numpy images end in channels: value.transpose(1, 2, 0)."
+        turn = "For numpy, put channels last: value.transpose(1, 2, 0)."
     if value.ndim != 3 or value.shape[channels] not in CHANNELS:
-        cures = {2: "Add a channel axis: value[None].", 3: turn, 4: "A batch is a list: list(value)."}
+        hints = {2: "Add a channel axis: value[None].", 3: turn, 4: "Pass a batch as a list: list(value)."}
         expected = f"an image of shape {shape}, of 1, 3 or 4 channels"
-        bad_value(name, expected, f"shape {tuple(value.shape)}", cures.get(value.ndim, ""))
+        bad_value(name, expected, f"shape {tuple(value.shape)}", hints.get(value.ndim, ""))
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu()
         value = value.float() if value.dtype == torch.bfloat16 else value  # numpy has no bfloat16
         value = value.permute(1, 2, 0).numpy()
     _check_sides(value.shape[1], value.shape[0], name)
-    # Readers of TIFF and PGM leave the file's byte order, which says nothing about the values.
+    # TIFF and PGM readers keep the file's byte order, which torch does not support.
     return value.astype(value.dtype.newbyteorder("="), copy=False)
 
 
-def picture_size(value: Any, name: str) -> tuple[int, int]:
-    """``(width, height)`` of what ``as_image_01`` takes, without a look at its pixels, nor its warnings."""
+def image_size_of(value: Any, name: str) -> tuple[int, int]:
+    """Return ``(width, height)`` of an input of ``as_image_01`` without reading pixels or warning."""
     if isinstance(value, Image.Image):
         _check_sides(*value.size, name)
         return value.size
@@ -186,13 +213,13 @@ def picture_size(value: Any, name: str) -> tuple[int, int]:
 
 
 def in_stored_pixels(value: Any) -> Any:
-    """Images from memory as they lie there, for cameras of the stored pixels: nobody need turn them.
+    """Mark images in memory as stored, so that their EXIF orientation is ignored without a warning.
 
-    A copy of a PIL image whose EXIF orientation says so; a list or tuple of images entry by entry.
+    Copies PIL images that have an EXIF orientation; processes lists and tuples per entry.
     """
     if isinstance(value, (list, tuple)):
         return type(value)(map(in_stored_pixels, value))
-    if not isinstance(value, Image.Image) or value.getexif().get(ORIENTATION) not in TURNS:
+    if not isinstance(value, Image.Image) or value.getexif().get(ORIENTATION) not in ORIENTATIONS:
         return value
     copy = value.copy()
     copy.getexif()[ORIENTATION] = UPRIGHT
@@ -200,35 +227,35 @@ def in_stored_pixels(value: Any) -> Any:
 
 
 def as_image_01(value: Any, name: str) -> torch.Tensor:
-    """An image from memory as a tensor ``(3, H, W)`` float32 in [0, 1] on the CPU; not differentiable.
+    """Convert an image in memory to a tensor ``(3, H, W)`` float32 in [0, 1] on the CPU; not differentiable.
 
-    ``value`` is a PIL image, as it lies in memory; numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``,
-    of uint8, uint16 or float in [0, 1]. One channel is repeated, a fourth dropped with a warning.
+    ``value`` is a PIL image (used as is), numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``, of
+    uint8, uint16 or float in [0, 1]. One channel is repeated; a fourth (alpha) is left out.
     """
     if isinstance(value, Image.Image):
-        of_file = _file_notes(value, name)
+        of_file = _file_findings(value, name)
         hwc, of_pixels = _to_01(_array_of(value, name), name)
-        notes = of_file + of_pixels
-        if value.getexif().get(ORIENTATION) in TURNS:
-            cure = "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image."
-            sentence = f"{name} carries an EXIF orientation that is not applied; {cure}"
-            notes.append(Message("image.orientation", sentence))
+        findings = of_file + of_pixels
+        if value.getexif().get(ORIENTATION) in ORIENTATIONS:
+            hint = "apply it with PIL.ImageOps.exif_transpose and pass K of the upright image."
+            sentence = f"{name} has an EXIF orientation that is not applied; {hint}"
+            findings.append(Finding("image.orientation", sentence))
     else:
-        hwc, notes = _to_01(_hwc(value, name), name)
-    for note in notes:
-        warn(note, stacklevel=3)
+        hwc, findings = _to_01(_hwc(value, name), name)
+    for finding in findings:
+        warn(finding, stacklevel=3)
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))
 
 
 def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
-    """K of a camera with square pixels and its principal point in the middle; ``fov_deg`` is horizontal."""
+    """Return K for square pixels and a central principal point; ``fov_deg`` is horizontal."""
     check_number(fov_deg, "fov", 1.0, 170.0)
     focal = size[0] / 2 / math.tan(math.radians(fov_deg) / 2)
     return intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
 def _exif_number(entries: Mapping[int, Any], tag: Base) -> float:
-    """A positive number of the EXIF data; 0 where there is none."""
+    """Return a positive number of the EXIF data, or 0 if missing."""
     try:
         value = float(entries.get(tag) or 0.0)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -237,27 +264,27 @@ def _exif_number(entries: Mapping[int, Any], tag: Base) -> float:
 
 
 def _check_uncropped(taken: tuple[float, float], size: tuple[int, int], name: str) -> None:
-    """Refuse an image of another shape than the one it was taken with; both are ``(width, height)``."""
+    """Raise an error if the aspect ratio differs from the original image's; both are ``(width, height)``."""
     width, height = size
     shapes = [(taken[0] / taken[1]) / shape for shape in (width / height, height / width)]
     if min(max(ratio, 1 / ratio) for ratio in shapes) > 1 + _SAME_SHAPE:
-        got = f"one of {taken[0]:.0f}x{taken[1]:.0f}: it was cropped since it was taken"
-        cure = f"Give the image as it was taken. {CURES}"
-        bad_value(f"EXIF of {name}", f"of an image of {width}x{height}", got, cure)
+        got = f"{taken[0]:.0f}x{taken[1]:.0f}: the image was cropped"
+        hint = f"Pass the original image. {HINT}"
+        bad_value(f"EXIF of {name}", f"for an image of {width}x{height}", got, hint, code="exif.cropped")
 
 
 def intrinsics_from_exif(
     source: PathLike | Image.Image, name: str, *, as_stored: bool = False
-) -> tuple[np.ndarray, list[Message]]:
-    """K of a photograph to a few per cent, and what was assumed.
+) -> tuple[np.ndarray, list[Finding]]:
+    """Estimate K of an image from EXIF to a few per cent, with findings about assumptions.
 
-    A file's is that of the upright image, unless it is to be read ``as_stored``; an image's as it lies.
+    For a file it refers to the upright image, unless ``as_stored``; an image in memory is used as is.
     """
     if not isinstance(source, Image.Image):
         with open_image(source, name) as image:
-            K, notes = intrinsics_from_exif(image, name)
-            turned = exif_of(image).get(ORIENTATION, 1) >= 5 and not as_stored
-        return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if turned else K, notes
+            K, findings = intrinsics_from_exif(image, name)
+            rotated = exif_of(image).get(ORIENTATION, 1) >= 5 and not as_stored
+        return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if rotated else K, findings
     number = partial(_exif_number, exif_of(source).get_ifd(IFD.Exif))
     width, height = source.size
     taken = number(Base.ExifImageWidth), number(Base.ExifImageHeight)
@@ -274,24 +301,71 @@ def intrinsics_from_exif(
         fy = fx * (number(Base.FocalPlaneYResolution) or per_unit_x) / per_unit_x
         focal = f"{focal_mm:g} mm on its sensor"
     else:
-        bad_value(f"K of {name}", "known", "no focal length in its EXIF", CURES)
-    notes = [Message("camera.from-exif", f"K of {name}: {focal} by its EXIF, {fx:.0f} px.")]
+        bad_value(f"K of {name}", "given", "no focal length in its EXIF", HINT, code="exif.missing")
+    findings = [Finding("camera.from-exif", f"K of {name}: {focal} in EXIF, {fx:.0f} px.")]
     if zoom > 1.01:
-        sentence = f"{name} was zoomed digitally by {zoom:g}; some cameras do not count that in."
-        notes.append(Message("camera.zoom", sentence))
-    return intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2), notes
+        sentence = (
+            f"{name} was taken with {zoom:g}x digital zoom, which some cameras omit from the focal length."
+        )
+        findings.append(Finding("camera.zoom", sentence))
+    return intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2), findings
 
 
 def warn_of_other_lens(source: PathLike | Image.Image, K: np.ndarray, name: str) -> None:
     """Warn of a focal length that contradicts the EXIF data of an uncropped image."""
     try:
-        theirs, notes = intrinsics_from_exif(source, name)
+        theirs, findings = intrinsics_from_exif(source, name)
     except InputError:
         return
     factor = K[0, 0] / theirs[0, 0]
-    zoomed = any(note.code == "camera.zoom" for note in notes)
+    zoomed = any(finding.code == "camera.zoom" for finding in findings)
     if not zoomed and max(factor, 1 / factor) >= _OTHER_LENS:
-        said = f"{factor:.2f} times the {theirs[0, 0]:.0f} px of its EXIF: is K for an image of another size?"
-        cure = "If it is, all metres are off by that factor."
-        sentence = f"K has a focal length of {K[0, 0]:.0f} px for {name}, {said} {cure}"
-        warn(Message("camera.other-lens", sentence), stacklevel=3)
+        factor_text = f"{factor:.2f} times the {theirs[0, 0]:.0f} px in its EXIF"
+        hint = "If K is for another image size, depth is wrong by that factor. Check K."
+        sentence = f"K has a focal length of {K[0, 0]:.0f} px for {name}, {factor_text}. {hint}"
+        warn(Finding("camera.focal-mismatch", sentence), stacklevel=3)
+
+
+class SplitViews(NamedTuple):
+    """Both views of an image, and their camera matrix."""
+
+    left: Any  # of the type of the image
+    right: Any
+    K: Any  # as given, for the pixels of the views
+
+
+def split_views(image: Any, K: Any, layout: str | None = None) -> SplitViews:
+    """Split an image that holds both views, left view first, for ``GeometryGuidance``.
+
+    >>> left, right, K = split_views(image, K, "half")
+
+    Half layouts squeeze the views. They stay as they are in the image, and K is adapted to their pixels.
+
+    Args:
+        image: PIL image, numpy ``(H, W, C)`` or torch ``(C, H, W)``.
+        K: ``(3, 3)`` intrinsics of a view before it was squeezed, pixels; or a tuple of both.
+        layout: ``"full"`` or ``"half"`` (side by side), ``"over-under"`` or ``"half-over-under"``; ``None``
+            infers it from shape and content, and warns.
+
+    Raises:
+        InputError: a wrong type or layout, or an odd width or height of the image.
+    """
+    pixels = np.asarray(image.convert("RGB")) if isinstance(image, Image.Image) else _hwc(image, "image")
+    if layout is None:
+        packing = find_packing([pixels], "the image")
+        if packing.finding is not None:
+            warn(packing.finding)
+    else:
+        packing = Packing(check_choice(layout, "layout", FRAME_LAYOUTS))
+    halves = packing.split(pixels, "image")
+    size = (halves[0].shape[1], halves[0].shape[0])
+    views: Sequence[Any] = halves
+    if isinstance(image, Image.Image):
+        views = [Image.fromarray(half) for half in halves]
+    elif isinstance(image, torch.Tensor):
+        views = image.chunk(2, dim=1 if packing.is_stacked else 2)
+    given = K if isinstance(K, tuple) else (K,)
+    Ks = tuple(
+        Camera(check_intrinsics(each, "K"), packing.shown_size(size)).resized(size).K for each in given
+    )
+    return SplitViews(views[0], views[1], Ks if isinstance(K, tuple) else Ks[0])

@@ -1,28 +1,27 @@
-"""Kapture's sensors, records and trajectories as a capture; the format has no unit.
+"""Reads Kapture's sensors, records and trajectories as a capture; the format has no unit.
 
 Source: ``kapture_format.adoc`` of naver/kapture: poses are world-to-device, camera models are COLMAP's.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats.colmap import model_camera
 from geodiff_plugin.formats.files import read_text
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
-from geodiff_plugin.formats.rigs import Camera, array_of, pose_of
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, posed
+from geodiff_plugin.formats.rigs import RawCamera, array_of, pose_of
 
-#: A sensor whose model is not known: its K is typed, or by EXIF.
+#: Model of an uncalibrated sensor, whose K comes from options or EXIF.
 UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
 
 
 def read_kapture(path: Path, images_at: Path | None = None) -> Layout | None:
-    """The images of ``sensors/records_camera.txt``, by their own pose or that of their rig."""
+    """Read the images of ``sensors/records_camera.txt``, with their own pose or their rig's."""
     for folder in (path / "sensors", path):
         files = [folder / f"{name}.txt" for name in ("sensors", "records_camera")]
         if all(file.is_file() for file in files):
@@ -31,14 +30,14 @@ def read_kapture(path: Path, images_at: Path | None = None) -> Layout | None:
 
 
 def _rows(file: Path) -> list[list[str]]:
-    """The fields of each line, which commas divide."""
+    """Return the comma-separated fields of each line."""
     lines = read_text(file, f"{file}").splitlines()
     rows = [[field.strip() for field in line.split(",")] for line in lines]
     return [row for row in rows if row != [""] and not row[0].startswith("#")]
 
 
 def _poses(file: Path) -> dict[tuple[str, str], np.ndarray]:
-    """Rigid transforms ``(4, 4)`` by the first two fields; those with a number left out are not known."""
+    """Return ``(4, 4)`` transforms by the first two fields, without incomplete ones."""
     if not file.is_file():
         return {}
     poses = {}
@@ -50,7 +49,7 @@ def _poses(file: Path) -> dict[tuple[str, str], np.ndarray]:
 
 
 def _kapture(folder: Path, images_at: Path | None) -> Layout:
-    cameras: dict[str, Camera | str | None] = {}
+    cameras: dict[str, RawCamera | str | None] = {}
     for device, _, kind, *words in _rows(folder / "sensors.txt"):
         if kind == "camera":
             cameras[device] = _camera(device, words)
@@ -69,15 +68,15 @@ def _kapture(folder: Path, images_at: Path | None) -> Layout:
             T_rig_from_world = trajectories.get((time, rig))
             T_camera_from_world = None if T_rig_from_world is None else T_camera_from_rig @ T_rig_from_world
         E = None if T_camera_from_world is None else np.linalg.inv(T_camera_from_world)
-        return Candidate(replace(frame, E=E), camera)
+        return posed(frame, E, camera)
 
     folders = [at for at in (folder / "records_data", folder) if at.is_dir()]
     images = Images([name for _, _, name, *_ in records], folders, folder, images_at)
-    return Layout("kapture", None, images.candidates(build, records), notes=images.notes)
+    return images.layout("kapture", records, build)
 
 
-def _camera(device: str, words: list[str]) -> Camera | str | None:
-    """The camera of ``model, w, h, parameters``; why it cannot be used; ``None`` where it is not known."""
+def _camera(device: str, words: list[str]) -> RawCamera | str | None:
+    """Return the camera of ``model, w, h, parameters``, a reason if unusable, or ``None`` if unknown."""
     model, width, height, *numbers = words
     if model == UNKNOWN_CAMERA:
         return None

@@ -1,36 +1,40 @@
-"""What a reader of captures returns, and how the images that a file names are found."""
+"""Result of a capture reader, and the search for images listed in a file."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.formats.image_files import LEVELS_UP, find_images, find_moved, is_any_there
-from geodiff_plugin.formats.rigs import Camera
-from geodiff_plugin.messages import Message
-from geodiff_plugin.types import Distortion
+from geodiff_plugin._internal.checks import InputError, bad_value
+from geodiff_plugin.cameras import Camera, Size
+from geodiff_plugin.findings import Finding
+from geodiff_plugin.formats.files import read_rows, read_text
+from geodiff_plugin.formats.image_files import LEVELS_UP, find_images, find_moved, images_of, is_any_there
+from geodiff_plugin.formats.rigs import RawCamera
 
-#: What a file says of one image.
+#: Entries of one image in a file.
 Entry = TypeVar("Entry")
-#: Why a frame without its photograph is left out.
+#: Reason for skipping a frame without an image.
 NO_IMAGE = "no image file"
-#: Why a frame that was not placed is left out.
+#: Reason for skipping a frame that was not aligned.
 NO_POSE = "no pose"
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureFrame:
-    """One frame; ``E`` is its camera-to-world pose in OpenCV's axes, ``None`` where none is given.
+    """One frame; ``E`` is its camera-to-world pose in OpenCV's axes, or ``None``.
 
-    ``as_stored`` says that the camera is one of the pixels as the file stores them: then the image is not
-    turned by its EXIF orientation, and depth comes out in the stored pixels. ``depth_per_m`` is units of the
-    depth map in a metre; ``None`` for one of floats in metres, or of whole millimetres.
+    ``camera`` is the camera of the original image with its lens; its size is set by ``read_capture``.
+    ``as_stored`` states that the camera refers to the pixels as stored: the EXIF orientation is then not
+    applied, and depth is in the stored pixels. ``depth_per_m`` is the depth map's units per metre; ``None``
+    for floats in metres or integers in millimetres. ``mask`` is the image of its valid pixels, which
+    are white.
     """
 
     name: str
@@ -40,45 +44,48 @@ class CaptureFrame:
     depth_per_m: float | None = None
     index: int | None = None
     points: np.ndarray | None = None
-    size: tuple[int, int] = (0, 0)
-    K: np.ndarray = field(default_factory=lambda: np.eye(3))
-    lens: Distortion | None = None
+    camera: Camera = field(default_factory=lambda: Camera(np.eye(3)))
     as_stored: bool = False
+    mask: Path | None = None
+
+    @property
+    def size(self) -> Size:
+        """``(width, height)`` of its image."""
+        return self.camera.known_size
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A frame as a reader finds it, its camera as the file has it, and why it cannot be used, if so."""
+    """A frame found by a reader, its camera as in the file, and the reason if it is unusable."""
 
     frame: CaptureFrame
-    camera: Camera | None = None
+    camera: RawCamera | None = None
     problem: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """What a reader returns: ``unit`` is ``"m"`` or ``None``; ``notes`` are for the user.
+    """Result of a reader: ``unit`` is ``"m"`` or ``None``; ``findings`` are messages for the user.
 
-    ``as_stored`` says in which pixels its cameras are, as ``CaptureFrame.as_stored``; ``has_poses`` that it
-    is more than images, as ``CaptureFormat.has_poses``.
+    ``as_stored`` is as in ``CaptureFrame.as_stored``; ``has_poses`` as in ``CaptureFormat.has_poses``.
     """
 
     kind: str
     unit: str | None
     candidates: Sequence[Candidate]
     as_stored: bool = True
-    notes: tuple[Message, ...] = ()
+    findings: tuple[Finding, ...] = ()
     has_poses: bool = True
 
 
 @dataclass(frozen=True)
 class CaptureFormat:
-    """One line of ``LAYOUTS``: ``read`` returns ``None`` for a path that is none of this format.
+    """One row of ``LAYOUTS``: ``read`` returns ``None`` for a path in another format.
 
-    ``marks`` are patterns of the files and folders by which it is recognised, in a tuple if one of several is
-    enough; where nothing is recognised, they say which format comes nearest. ``names_images``: its file names
-    images that may lie anywhere; then ``read`` also takes the folder that the user gives for them, or
-    ``None``. ``has_poses``: it is more than images.
+    ``marks`` are patterns of files and folders that identify it, in a tuple if one of several is sufficient.
+    If no format is recognised, they determine the most similar one. ``names_images``: its file lists images
+    that may be anywhere; ``read`` then also takes the user's image folder, or ``None``. ``has_poses``: it has
+    more than images.
     """
 
     summary: str
@@ -87,41 +94,113 @@ class CaptureFormat:
     names_images: bool = False
     has_poses: bool = True
 
+    @property
+    def patterns(self) -> list[tuple[str, ...]]:
+        """``marks``, each as a tuple of alternative patterns."""
+        return [(mark,) if isinstance(mark, str) else mark for mark in self.marks]
 
-def largest_part_notes(noun: str, images: Sequence[int]) -> tuple[Message, ...]:
-    """What to say where a file has several parts, of which the first and largest is read.
+
+def largest_part_findings(noun: str, images: Sequence[int]) -> tuple[Finding, ...]:
+    """Return a finding if a file has several parts, of which the largest (first) is read.
 
     Args:
-        noun: what the program that wrote the file calls a part.
-        images: how many images each part has, the largest number first; those without any count for nothing.
+        noun: name of a part in the program that wrote the file.
+        images: number of images per part in descending order; parts without images are ignored.
     """
     largest, *others = images
     left_out = ", ".join(str(count) for count in others if count)
     if not left_out:
         return ()
     sentence = (
-        f"The largest {noun}, of {largest} images, is used. Others are left out, as each has a frame of its "
-        f"own: those of {left_out} images."
+        f"The largest {noun}, with {largest} images, is used. Others (with {left_out} images) are "
+        f"ignored, as "
+        f"each has a separate coordinate frame."
     )
-    return (Message("capture.part", sentence),)
+    return (Finding("capture.part", sentence),)
 
 
-def build_frame(frame: CaptureFrame, build: Callable[[CaptureFrame], Candidate]) -> Candidate:
-    """What ``build`` makes of a frame; what is wrong with its camera or pose leaves out this frame alone."""
+def build_frame(
+    frame: CaptureFrame, build: Callable[[CaptureFrame, Entry], Candidate], entry: Entry
+) -> Candidate:
+    """Call ``build`` with a frame and its entry; an error only excludes this frame."""
     try:
-        return build(frame)
+        return build(frame, entry)
     except InputError as error:
         return Candidate(frame, None, str(error))
-    except Exception as error:  # of any kind that damaged entries lead to
-        return Candidate(frame, None, f"its entries do not read ({type(error).__name__}: {error})")
+    except Exception as error:  # any error that damaged entries may cause
+        return Candidate(frame, None, f"its entries cannot be read ({type(error).__name__}: {error})")
+
+
+def posed(
+    frame: CaptureFrame, E: np.ndarray | None, camera: RawCamera | None = None, **more: Any
+) -> Candidate:
+    """Return the frame with its camera-to-world pose and other fields, and its camera."""
+    return Candidate(replace(frame, E=E, **more), camera)
+
+
+def paired(
+    images: Iterable[Path], entries: Iterable[Entry], build: Callable[[CaptureFrame, Entry], Candidate]
+) -> list[Candidate]:
+    """Call ``build`` with the frame and entry of each image, in order; both have the same length."""
+    pairs = zip(images, entries, strict=True)
+    return [build_frame(CaptureFrame(image.stem, image), build, entry) for image, entry in pairs]
+
+
+def one_a_line(
+    images: Sequence[Path], file: Path, build: Callable[[CaptureFrame, list[str]], Candidate]
+) -> list[Candidate]:
+    """Call ``build`` with the frame of each image and the words of its line in a file of poses."""
+    rows = read_rows(file, f"{file}", "poses, one per line")
+    if len(rows) != len(images):
+        bad_value(f"{file.name}", f"a file with {len(images)} lines, one per image", f"{len(rows)}")
+    return paired(images, rows, build)
+
+
+@dataclass(frozen=True)
+class CameraPerImage:
+    """A format with one camera file per image. Called with a path, it reads the capture there.
+
+    Attributes:
+        kind: its name.
+        unit: unit of its poses: ``"m"``, or ``None`` if unknown.
+        files: patterns of images with the name of the camera file (``{}`` is the image's stem); the first
+            alternative that exists is used.
+        read: returns camera-to-world pose and camera from a file's text; the second argument is for errors.
+        depth: path of the depth map of an image.
+        below: subfolder of these files.
+        mark: text in the first camera file.
+    """
+
+    kind: str
+    unit: str | None
+    files: tuple[tuple[str, str], ...]
+    read: Callable[[str, str], tuple[np.ndarray, RawCamera]]
+    depth: Callable[[Path], Path | None] = lambda image: None
+    below: tuple[str, ...] = ("",)
+    mark: str = ""
+
+    def __call__(self, path: Path) -> Layout | None:
+        """Return the frames of a path; ``None`` for another capture."""
+        for folder, (pattern, name) in product(map(path.joinpath, self.below), self.files):
+            images = images_of(folder.glob(pattern))
+            files = [folder / name.format(image.stem) for image in images]
+            first = next((file for file in files if file.is_file()), None)
+            if first is not None and self.mark in read_text(first, "PATH"):
+                return Layout(self.kind, self.unit, paired(images, files, self._frame))
+        return None
+
+    def _frame(self, frame: CaptureFrame, file: Path) -> Candidate:
+        name = f"the camera of {frame.name}"
+        E, camera = self.read(read_text(file, name), name)
+        return posed(frame, E, camera, depth=self.depth(frame.image))
 
 
 class Images:
-    """The images that a file of cameras names.
+    """Images listed in a file of cameras.
 
-    They are looked for in ``folders`` of a ``project``, the first of which is that of the file, and where
-    none of them is there, anywhere near it, but not in folders that are called like one of ``other``. Where
-    ``given`` is a folder, they are looked for in and below that alone. ``notes`` say where they were found.
+    Searches ``folders`` of a ``project`` (the first is the file's folder), then any folder near it, except
+    folders with names in ``other``. If ``given`` is a folder, searches only that. ``findings`` state where
+    the images are.
     """
 
     def __init__(
@@ -132,7 +211,7 @@ class Images:
         given: Path | None = None,
         other: Sequence[str] = (),
     ) -> None:
-        self.names, self.notes = list(names), tuple[Message, ...]()
+        self.names, self.findings = list(names), tuple[Finding, ...]()
         once = list(dict.fromkeys(names))
         folders = folders if given is None else [_folder_of_images(given)]
         files, below = find_images(once, folders), project if project.is_dir() else project.parent
@@ -143,22 +222,33 @@ class Images:
             levels = LEVELS_UP if given is None else 0
             moved = find_moved(once, folders[0], levels, other)
             if moved is None:
-                self._problem += " or elsewhere near it: say where they lie (--images)"
+                self._problem += " or elsewhere near it; pass their folder (--images)"
             else:
                 files, at = moved.files, os.path.relpath(moved.below, below)
-                sentence = f"The images are those below {at}, since there is none in {searched}."
-                self.notes = (Message("capture.images-found", sentence),) if given is None else ()
+                sentence = f"Images are read from {at}, because {searched} has none."
+                self.findings = (Finding("capture.images-found", sentence),) if given is None else ()
         self._files, self._used = dict(zip(once, files, strict=True)), set[str]()
 
     def file(self, name: str) -> Path | None:
-        """The image of a name, if there is one."""
+        """Return the image with a name, or ``None``."""
         return self._files[name]
 
     def candidates(
         self, build: Callable[[CaptureFrame, Entry], Candidate], entries: Iterable[Entry]
     ) -> list[Candidate]:
-        """What ``build`` makes of the frame of each name that has a file, and of its entry; in order."""
+        """Call ``build`` with frame and entry of each name that has a file, in order."""
         return [self._candidate(*each, build) for each in zip(self.names, entries, strict=True)]
+
+    def layout(
+        self,
+        kind: str,
+        entries: Iterable[Entry],
+        build: Callable[[CaptureFrame, Entry], Candidate],
+        unit: str | None = None,
+        findings: Sequence[Finding] = (),
+    ) -> Layout:
+        """Return the layout of ``candidates``, with findings about where the images are."""
+        return Layout(kind, unit, self.candidates(build, entries), findings=(*self.findings, *findings))
 
     def _candidate(
         self, name: str, entry: Entry, build: Callable[[CaptureFrame, Entry], Candidate]
@@ -166,7 +256,7 @@ class Images:
         file, twice = self._files[name], name in self._used
         self._used.add(name)
         if file is not None and not twice:
-            return build_frame(CaptureFrame(file.stem, file), lambda frame: build(frame, entry))
+            return build_frame(CaptureFrame(file.stem, file), build, entry)
         missing = Path(name.replace("\\", "/"))
         problem = "named twice; the first is used" if twice else self._problem
         return Candidate(CaptureFrame(missing.name, missing), None, problem)
@@ -174,19 +264,19 @@ class Images:
 
 def _folder_of_images(given: Path) -> Path:
     if not given.is_dir():
-        cure = "Give the folder that holds the images, or folders of them."
-        bad_value("images (--images)", "a folder", f"{given}, which is none", cure)
+        hint = "Pass the folder that contains the images or their folders."
+        bad_value("images (--images)", "a folder", f"{given}, which is not a folder", hint)
     return given
 
 
 def _folder_name(name: str) -> str:
-    """A name that a folder of results can have: none of ``..``, not hidden, without control characters."""
+    """Return a valid folder name: not ``..``, not hidden, without control characters."""
     printable = "".join(letter if letter.isprintable() else "_" for letter in name)
     return f"_{printable.lstrip('.')}" if printable.startswith(".") else printable
 
 
 def unique_names(frames: Sequence[CaptureFrame]) -> list[str]:
-    """A name for every frame that no other has: its own, with as many folders before it as it takes."""
+    """Return a unique name for every frame, with as many parent folders as necessary."""
     paths = [frame.image.parent.parts for frame in frames]
     names = [_folder_name(frame.name) for frame in frames]
     for folders in range(max(map(len, paths), default=0) + 1):
@@ -194,4 +284,4 @@ def unique_names(frames: Sequence[CaptureFrame]) -> list[str]:
         longer = ["-".join([*parts[max(0, len(parts) - folders) :], name]) for parts, name in pairs]
         if len(set(longer)) == len(longer):
             return [_folder_name(name.replace("/", "-")) for name in longer]
-    return [f"{name}-{number}" for number, name in enumerate(names)]  # one file named twice
+    return [f"{name}-{number}" for number, name in enumerate(names)]  # one file listed twice

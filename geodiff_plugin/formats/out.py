@@ -1,4 +1,4 @@
-"""Output: a file or a folder appears whole or not at all; what cannot be written is said before the work."""
+"""Output files and folders: complete or absent, with errors reported before the work."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, NoReturn, Self, TypeVar
 
-from geodiff_plugin._checks import InputFileError, MissingFileError, bad_value
-from geodiff_plugin._signals import undisturbed
+from geodiff_plugin._internal.checks import InputFileError, MissingFileError, bad_value
+from geodiff_plugin._internal.signals import defer_signals
 
 try:
     import fcntl
-except ImportError:  # Windows: two runs with one folder are not detected
+except ImportError:  # Windows: two runs in one folder are not detected
     fcntl = None  # type: ignore[assignment]
 
-#: Folder in which results are written before they take their place, as a whole.
+#: Temporary folder for results until they are complete.
 PARTIAL = ".geodiff-partial"
-#: Its file that a run locks, so that no other takes the folder.
+#: Name of the lock file in it.
 LOCK = "lock"
-#: Its folder of what has been written so far.
+#: Subfolder with the files written so far.
 FILES = "files"
-#: The lock of a folder that a run works in for long, in full view of other runs.
+#: Lock file in a folder used for a long run, visible to other runs.
 FOLDER_LOCK = ".geodiff-lock"
 REPORT = "report.json"
-LEAST_FREE_BYTES = 8 << 20
+MIN_FREE_BYTES = 8 << 20
 
 Result = TypeVar("Result")
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside ``path``, renamed to it when the block ends well, else removed."""
+    """Return a temporary path next to ``path``, renamed to it if the block succeeds, otherwise deleted."""
     target = Path(path)
     if os.path.isdir(target):
-        bad_value("The output", "a file", f"the folder {target}", "Name a file inside of it.", InputFileError)
+        bad_value("The output", "a file", f"the folder {target}", "Pass a file in it.", InputFileError)
     if not os.path.isdir(target.parent):
-        cure = f"Make the folder {target.parent} first."
-        bad_value("The output", "in an existing folder", target, cure, MissingFileError)
+        hint = f"Create the folder {target.parent} first."
+        bad_value("The output", "in an existing folder", target, hint, MissingFileError)
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
         yield temporary
@@ -56,69 +56,69 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all, making its folder where missing."""
+    """Write a file completely or not at all; creates its folder if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def reason_of(error: OSError) -> str:
-    """The system's words for what went wrong, without the path."""
+    """Return the system's message of an error, without the path."""
     return error.strerror or str(error)
 
 
-def unwritable(path: Path, error: OSError) -> NoReturn:
-    """Refuse an output folder that takes no file."""
-    cure = "Name another with --out, or free disk space and check its permissions."
-    bad_value("--out", "a folder that can be written to", f"{path} ({reason_of(error)})", cure)
+def raise_unwritable(path: Path, error: OSError) -> NoReturn:
+    """Raise an error for an output folder that is not writable."""
+    hint = "Choose another --out, or free disk space and check its permissions."
+    bad_value("--out", "a writable folder", f"{path} ({reason_of(error)})", hint)
 
 
-def _beside(target: Path) -> Path:
+def _sibling(target: Path) -> Path:
     return target.parent / f".{target.name}{PARTIAL}"
 
 
 def _hidden(target: Path) -> Path:
-    """The folder of unfinished files and of the lock: inside of one that exists, which may be a disk."""
-    return target / PARTIAL if target.is_dir() else _beside(target)
+    """Return the hidden folder of unfinished files and lock; inside an existing target (may be a mount)."""
+    return target / PARTIAL if target.is_dir() else _sibling(target)
 
 
 def check_out(path: Path) -> Path:
-    """The place that an output folder has or will have, links followed."""
+    """Return the absolute path of an output folder, with links resolved."""
     try:
         target = Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for a link to itself
-        for place in (target, _beside(target)):  # the latter has the longest name that will be needed
+        for place in (target, _sibling(target)):  # the latter has the longest name that will be used
             with suppress(FileNotFoundError):
                 os.stat(place)
     except OSError as error:
-        unwritable(path, error)
+        raise_unwritable(path, error)
     if target.exists() and not target.is_dir():
-        bad_value("--out", "a folder", f"the file {path}", "Name a folder.")
+        bad_value("--out", "a folder", f"the file {path}", "Pass a folder.")
     return target
 
 
 def _holds_files(target: Path) -> bool:
-    """Whether a folder is there and has more in it than what an unfinished run left."""
+    """Whether a folder exists and contains more than leftovers of an unfinished run."""
     left = (PARTIAL, FOLDER_LOCK)
     return target.is_dir() and any(path.name not in left for path in target.iterdir())
 
 
 def check_new(path: Path, overwrite: bool) -> Path:
-    """``check_out`` of a folder that is new or empty, unless it may be overwritten."""
+    """Call ``check_out`` for a folder that must be new or empty, unless it may be overwritten."""
     target = check_out(path)
     if _holds_files(target) and not overwrite:
-        cure = "Name another, or add --overwrite."
-        bad_value("--out", "a new or empty folder", f"{path}, which holds files", cure)
+        hint = "Choose another, or add --overwrite."
+        bad_value("--out", "a new or empty folder", f"{path}, which contains files", hint)
     return target
 
 
 def check_new_file(path: Path, overwrite: bool) -> None:
-    """Refuse to replace an output file that nobody allowed to."""
+    """Raise an error if an output file exists and may not be overwritten."""
     if path.exists() and not overwrite:
-        bad_value("--out", "a new file", f"{path}, which exists", "Name another, or add --overwrite.")
+        bad_value("--out", "a new file", f"{path}, which exists", "Choose another, or add --overwrite.")
 
 
 def free_folder(default: Path) -> Path:
-    """A folder for a run that named none: ``default``, or ``default-2`` and so on where that is taken."""
+    """Return a default output folder: ``default``, or ``default-2`` etc. if it exists."""
     path = default
     for number in itertools.count(2):
         taken = os.path.lexists(path) and (not path.is_dir() or _holds_files(path))
@@ -129,9 +129,10 @@ def free_folder(default: Path) -> Path:
 
 
 def lock_file(file: IO[bytes], shared: bool = False) -> bool:
-    """Lock an open file until it is closed or the process ends, alone or with others that share it.
+    """Lock an open file until it is closed or the process ends, exclusively or ``shared``.
 
-    ``False`` where another has it. Windows and file systems without locks notice nobody.
+    Returns ``False`` if another process has locked it. On Windows and file systems without locks always
+    succeeds.
     """
     if not fcntl:
         return True
@@ -144,79 +145,82 @@ def lock_file(file: IO[bytes], shared: bool = False) -> bool:
     return True
 
 
+def _lock(path: Path, stack: ExitStack, shared: bool = False) -> IO[bytes] | None:
+    """Create and lock ``path`` until ``stack`` is closed or the process ends; ``None`` if it is locked."""
+    while True:
+        file = stack.enter_context(open(path, "ab"))
+        if not lock_file(file, shared):
+            return None
+        if os.fstat(file.fileno()).st_nlink:
+            return file  # otherwise its owner deleted it after it was opened here; try again
+
+
 @contextmanager
-def working_in(folder: Path, *, shared: bool = False) -> Iterator[None]:
-    """Have a folder alone, or with others that share it, until the block ends; else ``InputError``."""
+def locked_folder(folder: Path, *, shared: bool = False) -> Iterator[None]:
+    """Lock a folder until the block ends, exclusively or ``shared``; raise ``InputError`` if it is locked."""
     path = folder / FOLDER_LOCK
     with ExitStack() as stack:
-        with undisturbed():
+        with defer_signals():
             try:
-                file = stack.enter_context(open(path, "ab"))
+                file = _lock(path, stack, shared)
             except OSError as error:
-                unwritable(folder, error)
-            while (taken := lock_file(file, shared)) and os.fstat(file.fileno()).st_nlink == 0:
-                file = stack.enter_context(open(path, "ab"))  # whoever had it has just removed it
-            if not taken:
-                got, cure = f"{folder}, which one is working in", "Wait for it, or name another."
-                bad_value("--out", "a folder that no other run has", got, cure)
-            stack.callback(_remove_lock, path, file)
+                raise_unwritable(folder, error)
+            if file is None:
+                got, hint = f"{folder}, which another run is using", "Wait for it, or choose another."
+                bad_value("--out", "a folder that no other run uses", got, hint)
+            stack.callback(_unlock, path, file)
         yield
 
 
-def _remove_lock(path: Path, file: IO[bytes]) -> None:
-    with undisturbed(), suppress(OSError):  # Windows removes no open file
-        if lock_file(file):  # the last of those that shared it
+def _unlock(path: Path, file: IO[bytes]) -> None:
+    """Delete a lock file, unless another run shares it."""
+    with defer_signals(), suppress(OSError):  # Windows does not delete open files
+        if lock_file(file):
             path.unlink()
-
-
-def _take(hidden: Path, stack: ExitStack) -> bool:
-    """Lock a hidden folder until ``stack`` is closed, or the process ends; ``False`` where another has it."""
-    file = stack.enter_context(open(hidden / LOCK, "ab"))
-    # A run that ended meanwhile has removed the file: nobody's lock.
-    return lock_file(file) and os.fstat(file.fileno()).st_nlink > 0
 
 
 def _held(hidden: Path) -> bool:
     """Whether the process that writes there is alive."""
-    with ExitStack() as stack:
-        return (hidden / LOCK).is_file() and not _take(hidden, stack)
+    with ExitStack() as stack, suppress(FileNotFoundError):  # the folder of a run that ends at this moment
+        return (hidden / LOCK).is_file() and _lock(hidden / LOCK, stack) is None
+    return False
 
 
 def files_of_report(folder: Path) -> set[str]:
-    """Names of the files that an earlier run wrote there, as its report lists them."""
+    """Return the names of files that an earlier run wrote there, as listed in its report."""
     try:
         names = json.loads((folder / REPORT).read_text(encoding="utf-8"))["files"]["names"]
         return {name for name in names if Path(name).name == name} if isinstance(names, list) else set()
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # none, or of something else
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # missing, or not a report
         return set()
 
 
 @dataclass(frozen=True)
-class HeldPlace:
-    """Where the files of a held ``OutFolder`` go; another process may write them while this one holds it."""
+class HeldFolder:
+    """Target of a held ``OutFolder``; another process may write files to it while this one holds it."""
 
-    path: Path  # as the user named it
-    target: Path  # the same, absolute, links followed
-    staging: Path  # the hidden folder, locked
+    path: Path  # as given by the user
+    target: Path  # absolute, with links resolved
+    staging: Path  # hidden folder, locked
 
     def write(self, fill: Callable[[Path], Result]) -> Result:
-        """Let ``fill`` write into an empty folder, whose files are then moved; returns what ``fill`` does."""
+        """Call ``fill`` with an empty folder, then move its files; returns the result of ``fill``."""
         files = self.staging / FILES
         try:
             files.mkdir()
             result = fill(files)
             self._move(files)
-        except InputFileError:  # of a file that it names
+        except InputFileError:  # states the file itself
             raise
         except OSError as error:
-            cure = "Free disk space or check its permissions, and run it again."
-            raise InputFileError(f"{self.path} could not be written ({reason_of(error)}). {cure}") from error
+            hint = "Free disk space or check its permissions, and run it again."
+            raise InputFileError(f"{self.path} could not be written ({reason_of(error)}). {hint}") from error
         finally:
             shutil.rmtree(files, ignore_errors=True)
         return result
 
     def _move(self, files: Path) -> None:
-        """Let a new folder appear by one rename; in one that exists replace each file, the report last."""
+        """Move a new folder with one rename; in an existing one replace each file, the report last."""
         if not self.target.is_dir():
             os.rename(files, self.target)
             return
@@ -226,15 +230,15 @@ class HeldPlace:
         for path in (self.target / name for name in earlier - written):
             if path.is_file():
                 path.unlink()
-        if REPORT in written:  # last: until then the old one lists what is still to go
+        if REPORT in written:  # last: until then the old report lists files that still have to be deleted
             os.replace(files / REPORT, self.target / REPORT)
 
 
 class OutFolder:
-    """A folder that this process alone writes to, from before the work until the result is in it.
+    """An output folder locked by this process from before the work until the result is in it.
 
-    Whatever speaks against it is said on entry, also that it holds one of ``inputs``. With ``overwrite`` it
-    may hold files: an earlier run's, by its report, go; all others stay.
+    Raises errors on entry, also if it contains one of ``inputs``. With ``overwrite`` it may contain files:
+    those in an earlier run's report are deleted, all others kept.
     """
 
     def __init__(self, path: Path, *, inputs: Collection[Path] = (), overwrite: bool = False) -> None:
@@ -243,53 +247,60 @@ class OutFolder:
 
     def __enter__(self) -> Self:
         self._target = check_new(self.path, self._overwrite)
-        for path in self._inputs if self._target.is_dir() else ():
-            if any(path.exists() and path.samefile(e) for e in self._target.iterdir() if e.is_file()):
-                got = f"{self.path}, which holds {path}"  # and which the run may replace or delete
-                bad_value("--out", "a folder that holds no input of the run", got, "Name another.")
+        self._check_without_inputs()
         self._staging = _hidden(self._target)
         try:
-            with undisturbed():
+            with defer_signals():
                 self._begin(self._stack)
             return self
         except OSError as error:
             self.__exit__()
-            unwritable(self.path, error)
+            raise_unwritable(self.path, error)
         except BaseException:
             self.__exit__()
             raise
 
     def __exit__(self, *_: object) -> None:
-        with undisturbed():
+        with defer_signals():
             self._stack.close()
 
+    def _check_without_inputs(self) -> None:
+        """Raise an error if the folder contains an input, which the run might replace or delete."""
+        if not self._inputs or not self._target.is_dir():
+            return
+        files = [file for file in self._target.iterdir() if file.is_file()]
+        for path in self._inputs:
+            if any(path.exists() and path.samefile(file) for file in files):
+                got = f"{self.path}, which holds {path}"
+                bad_value("--out", "a folder without inputs of the run", got, "Choose another.")
+
     def _begin(self, stack: ExitStack) -> None:
-        """Make the hidden folder, take its lock, and clear what a killed run has left in it."""
-        staging, beside = self._staging, _beside(self._target)
+        """Create and lock the hidden folder, and delete leftovers of a killed run."""
+        staging, sibling = self._staging, _sibling(self._target)
         for path in reversed([path for path in (staging, *staging.parents) if not path.exists()]):
             path.mkdir(exist_ok=True)
             stack.callback(_remove_empty, path)
-        # Beside it writes a run that began before the folder was there.
-        if (staging != beside and _held(beside)) or not _take(staging, stack):
+        # A run that started before the folder existed writes next to it.
+        if (staging != sibling and _held(sibling)) or _lock(staging / LOCK, stack) is None:
             got = f"{self.path}, which another process is writing to"
-            bad_value("--out", "a folder that no other run has", got, "Wait for it, or name another.")
+            bad_value("--out", "a folder that no other run uses", got, "Wait for it, or choose another.")
         stack.callback(shutil.rmtree, staging, ignore_errors=True)
-        if shutil.disk_usage(staging).free < LEAST_FREE_BYTES:
+        if shutil.disk_usage(staging).free < MIN_FREE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        if (staging / FILES).exists():  # we have the lock, so whoever made them is gone
+        if (staging / FILES).exists():  # it is unlocked, so the process that created them has ended
             shutil.rmtree(staging / FILES)
-            print(f"geodiff: removed what a killed run had left in {staging}", file=sys.stderr, flush=True)
+            print(f"geodiff: removed leftovers of a killed run in {staging}", file=sys.stderr, flush=True)
 
     @property
-    def place(self) -> HeldPlace:
-        """Where its files go, while it is held."""
-        return HeldPlace(self.path, self._target, self._staging)
+    def place(self) -> HeldFolder:
+        """Return the target of its files; valid while it is held."""
+        return HeldFolder(self.path, self._target, self._staging)
 
     def write(self, fill: Callable[[Path], Result]) -> Result:
-        """Write into its place, as ``HeldPlace.write`` does."""
+        """Write to its target, like ``HeldFolder.write``."""
         return self.place.write(fill)
 
 
 def _remove_empty(folder: Path) -> None:
-    with suppress(OSError):  # not empty: the result is in it
+    with suppress(OSError):  # not empty: it contains the result
         folder.rmdir()

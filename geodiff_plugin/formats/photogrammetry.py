@@ -1,4 +1,4 @@
-"""Photogrammetry and older structure from motion: Metashape, OpenSfM, Bundler, VisualSFM; none has a unit.
+"""Reads Metashape, OpenSfM, Bundler and VisualSFM, whose lengths have no unit.
 
 Source: ``process_data/metashape_utils.py`` of nerfstudio-project/nerfstudio and the camera models of
 Metashape's manual; ``doc/source/geometry.rst`` and ``dataset.rst`` of mapillary/OpenSfM; ``README.md`` of
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -18,18 +18,25 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin._internal.checks import InputError, bad_value
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.formats.files import parse_xml, read_text, stored_size
 from geodiff_plugin.formats.image_files import IMAGE_FOLDERS, files_of, image_folders
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, largest_part_notes
-from geodiff_plugin.formats.rigs import Camera, array_of, central_camera, intrinsics, pose_of, rigid
+from geodiff_plugin.formats.layouts import (
+    Candidate,
+    CaptureFrame,
+    Images,
+    Layout,
+    largest_part_findings,
+    posed,
+)
+from geodiff_plugin.formats.rigs import RawCamera, array_of, central_camera, intrinsics, pose_of, rigid
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
-from geodiff_plugin.messages import Message
 
-#: Metashape's terms of a lens that OpenCV's model does not have; others are read.
+#: Metashape's lens coefficients that OpenCV's model lacks.
 NO_LENS_TERMS = ("k4", "p3", "p4")
 UNDISTORT = "Undistort in Metashape (File, Export, Convert Images) and export its cameras."
-#: OpenSfM's projections, by OpenCV's model, and their coefficients in its order.
+#: OpenCV's models of OpenSfM's projections, with their coefficients in its order.
 OPENSFM_LENSES = {
     "perspective": ("opencv", ("k1", "k2", "", "")),
     "simple_radial": ("opencv", ("k1", "", "", "")),
@@ -38,9 +45,9 @@ OPENSFM_LENSES = {
     "fisheye": ("fisheye", ("k1", "k2", "", "")),
     "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
-#: OpenSfM's folder of a model of undistorted images.
+#: OpenSfM's folder of the undistorted model.
 UNDISTORTED = "undistorted"
-#: Names of the list of images that belongs to a file of Bundler.
+#: Names of Bundler's list of images.
 LISTS = ("list.txt", "pictures.txt", "bundle.out.list.txt", "prepare/list.txt", "list_tmp.txt")
 Entries = dict[str, Any]
 
@@ -49,7 +56,7 @@ Entries = dict[str, Any]
 
 
 def read_metashape(path: Path, images_at: Path | None = None) -> Layout | None:
-    """Metashape's ``cameras.xml``: camera-to-world poses, in metres where the chunk has a scale."""
+    """Read Metashape's ``cameras.xml``: camera-to-world poses, in metres if the chunk has a scale."""
     for file in files_of(path, "*.xml"):
         text = read_text(file, "PATH")
         if "<chunk" in text and "<camera" in text:
@@ -59,22 +66,22 @@ def read_metashape(path: Path, images_at: Path | None = None) -> Layout | None:
 
 @dataclass(frozen=True, eq=False)
 class ChunkPart:
-    """A chunk of Metashape and the component in it whose poses are in one frame; ``None`` in older files."""
+    """A chunk of Metashape, and its component with poses in one frame (``None`` in older files)."""
 
     chunk: Element
     component: str | None
 
     def cameras(self) -> list[Element]:
-        """Its cameras that have a name, placed or not."""
+        """Its cameras that have a name, aligned or not."""
         every = [camera for camera in self.chunk.iter("camera") if camera.get("label")]
         return [camera for camera in every if camera.get("component_id") in (self.component, None)]
 
     def placed(self) -> int:
-        """How many of them have a pose."""
+        """Number of cameras with a pose."""
         return sum(camera.find("transform") is not None for camera in self.cameras())
 
     def scale(self) -> float:
-        """Metres of its unit of length; 1 where it has none."""
+        """Metres per unit of length; 1 if it has none."""
         components = self.chunk.iter("component")
         own = [each for each in components if self.component is None or each.get("id") == self.component]
         nodes = [node for each in (*own, self.chunk) for node in each.findall("transform/scale")]
@@ -82,7 +89,7 @@ class ChunkPart:
 
 
 def _parts(root: Element) -> list[ChunkPart]:
-    """What may have poses in a frame of its own, that with most placed cameras first."""
+    """Return the parts with separate coordinate frames, the one with most aligned cameras first."""
     parts = []
     for chunk in root.iter("chunk"):
         names = dict.fromkeys(camera.get("component_id") for camera in chunk.iter("camera"))
@@ -93,10 +100,10 @@ def _parts(root: Element) -> list[ChunkPart]:
 def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
     parts = _parts(root)
     if not parts:
-        cure = "Align the photos in Metashape, then export the cameras again."
-        bad_value("PATH", "Metashape's cameras", f"{file} without a camera", cure)
+        hint = "Align the photos in Metashape, then export the cameras again."
+        bad_value("PATH", "Metashape's cameras", f"{file} without a camera", hint)
     part = parts[0]
-    sensors: dict[str | None, Camera | str] = {}
+    sensors: dict[str | None, RawCamera | str] = {}
     for sensor in part.chunk.iter("sensor"):
         try:
             sensors[sensor.get("id")] = _metashape_camera(sensor)
@@ -115,15 +122,14 @@ def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
             return Candidate(frame, sensor)
         E = rigid(matrix.split(), "transform")
         E[:3, 3] *= scale
-        return Candidate(replace(frame, E=E), sensor)
+        return posed(frame, E, sensor)
 
-    candidates = images.candidates(build, cameras)
-    notes = (*images.notes, *largest_part_notes("chunk or component", [each.placed() for each in parts]))
-    return Layout("Metashape", None if scale == 1.0 else "m", candidates, notes=notes)
+    findings = largest_part_findings("chunk or component", [each.placed() for each in parts])
+    return images.layout("Metashape", cameras, build, None if scale == 1.0 else "m", findings)
 
 
-def _metashape_camera(sensor: Element) -> Camera:
-    """The adjusted camera of a sensor; P1 and P2 change places in OpenCV's order."""
+def _metashape_camera(sensor: Element) -> RawCamera:
+    """Return the adjusted camera of a sensor; P1 and P2 are swapped in OpenCV's order."""
     kind = sensor.get("type", "frame")
     if kind != "frame":
         bad_value("a sensor of Metashape", "of type frame", kind, UNDISTORT)
@@ -131,8 +137,8 @@ def _metashape_camera(sensor: Element) -> Camera:
     adjusted = (each for each in found if each.get("class") == "adjusted")
     calibration = next(adjusted, next(iter(found), None))
     if calibration is None:
-        cure = "Align the cameras first; without it a sensor has no focal length."
-        bad_value("a sensor of Metashape", "calibrated", "no calibration", cure)
+        hint = "Align the cameras first; unaligned sensors have no focal length."
+        bad_value("a sensor of Metashape", "calibrated", "no calibration", hint)
     value = {node.tag: float(node.text or 0) for node in calibration if node.tag != "resolution"}
     others = {term: value[term] for term in NO_LENS_TERMS if value.get(term)}
     if others:
@@ -147,18 +153,18 @@ def _metashape_camera(sensor: Element) -> Camera:
     K = intrinsics(f + value.get("b1", 0.0), f, *centre)
     K[0, 1] = value.get("b2", 0.0)
     lens = [value.get(key, 0.0) for key in ("k1", "k2", "p2", "p1", "k3")]
-    return Camera(K, (width, height), lens)
+    return RawCamera(K, (width, height), lens)
 
 
 # OpenSfM
 
 
 def read_opensfm(path: Path, images_at: Path | None = None) -> Layout | None:
-    """OpenSfM's ``reconstruction.json``, its largest part; poses are world-to-camera."""
+    """Read the largest part of OpenSfM's ``reconstruction.json``; poses are world-to-camera."""
     for file in files_of(path, "*reconstruction*.json", "opensfm/reconstruction.json"):
         data = json.loads(read_text(file, "PATH"))
         if data == []:
-            bad_value("reconstruction.json", "with images that were placed", f"{file} with none")
+            bad_value("reconstruction.json", "with aligned images", f"{file} with none")
         if isinstance(data, list) and all("shots" in each and "cameras" in each for each in data):
             return _opensfm(file, data, images_at)
     return None
@@ -168,7 +174,7 @@ def _opensfm(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
     parts = sorted(data, key=lambda each: len(each["shots"]), reverse=True)
     part = parts[0]
     shots = sorted(part["shots"].items())
-    # Beside a model of undistorted images; those of the same names above it are the distorted ones.
+    # Next to a model of undistorted images; images with the same names in the parent folder are distorted.
     undistorted = file.parent.name == UNDISTORTED
     folders = image_folders(file.parent, *(() if undistorted else (file.parent.parent,)))
     distorted = IMAGE_FOLDERS if undistorted and images_at is None else ()
@@ -177,18 +183,17 @@ def _opensfm(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
     def build(frame: CaptureFrame, shot: Entries) -> Candidate:
         turn = Rotation.from_rotvec(array_of(shot["rotation"], (3,), "rotation"))
         T = pose_of(turn, shot["translation"])
-        return Candidate(replace(frame, E=np.linalg.inv(T)), _opensfm_camera(part["cameras"][shot["camera"]]))
+        return posed(frame, np.linalg.inv(T), _opensfm_camera(part["cameras"][shot["camera"]]))
 
-    candidates = images.candidates(build, (shot for _, shot in shots))
-    notes = [*images.notes, *largest_part_notes("part", [len(each["shots"]) for each in parts])]
+    findings = [*largest_part_findings("part", [len(each["shots"]) for each in parts])]
     if (file.parent / "reference_lla.json").is_file():
-        sentence = "Its lengths are metres as exact as its GPS: give --metres-per-unit 1 to take them."
-        notes.append(Message("capture.gps-scale", sentence))
-    return Layout("OpenSfM", None, candidates, notes=tuple(notes))
+        sentence = "Its lengths are in metres with GPS accuracy; pass --metres-per-unit 1 to use them."
+        findings.append(Finding("capture.gps-scale", sentence))
+    return images.layout("OpenSfM", (shot for _, shot in shots), build, findings=findings)
 
 
-def _opensfm_camera(entries: Entries) -> Camera:
-    """A camera in shares of the longer side; its first pixel's centre is at (0, 0), as ours."""
+def _opensfm_camera(entries: Entries) -> RawCamera:
+    """Read a camera in fractions of the longer side, converted to pixels with the first centre at (0, 0)."""
     kind = entries.get("projection_type", "perspective")
     if kind not in OPENSFM_LENSES:
         bad_value("projection_type", f"one of {', '.join(OPENSFM_LENSES)}", kind, "Run opensfm undistort.")
@@ -200,14 +205,16 @@ def _opensfm_camera(entries: Entries) -> Camera:
     centre = [
         entries.get(key, 0.0) * longer + (side - 1) / 2 for key, side in (("c_x", width), ("c_y", height))
     ]
-    return Camera(intrinsics(fx, fy, *centre), (width, height), [entries.get(n, 0.0) for n in names], model)
+    return RawCamera(
+        intrinsics(fx, fy, *centre), (width, height), [entries.get(n, 0.0) for n in names], model
+    )
 
 
 # Bundler and VisualSFM
 
 
 def read_bundler(path: Path, images_at: Path | None = None) -> Layout | None:
-    """Bundler's ``bundle.out`` and its list of images: world-to-camera, OpenGL's axes, central cameras."""
+    """Read Bundler's ``bundle.out`` and list of images: world-to-camera, OpenGL's axes, central cameras."""
     for file in files_of(path, "*.out", "bundle/*.out"):
         with file.open(encoding="utf-8", errors="replace") as opened:
             if opened.readline().startswith("# Bundle file"):
@@ -224,33 +231,33 @@ def _bundler(file: Path, counts: str, lines: Iterator[str], images_at: Path | No
     ]
     listed = next((each for each in names_of if each.is_file()), None)
     if listed is None:
-        cure = "Bundler numbers its images: put the list.txt that it was run with beside it, a name a line."
+        hint = "Bundler refers to images by number. Put its list.txt (one name per line) next to it."
         bad_value(
-            "PATH", f"{file.name} with its list of images ({', '.join(LISTS[:2])})", f"{file} without", cure
+            "PATH", f"{file.name} with its list of images ({', '.join(LISTS[:2])})", f"{file} without", hint
         )
     text = read_text(listed, "the list of images")
     names = [line.split()[0] for line in text.splitlines() if line.strip()]
     count = int(counts.split()[0])
     if count != len(names):
-        bad_value(f"{listed.name}", f"of the {count} images of {file.name}", f"{len(names)}")
+        bad_value(f"{listed.name}", f"a list of the {count} images in {file.name}", f"{len(names)}")
     images = Images(names, image_folders(*above), file, images_at)
 
     def build(frame: CaptureFrame, rows: list[str]) -> Candidate:
         f, k1, k2 = array_of(rows[0].split(), (3,), "f k1 k2")
-        if f == 0:  # an image that was not registered
+        if f == 0:  # unregistered image
             return Candidate(frame)
         R, t = (array_of(" ".join(part).split(), (-1,), "R, t") for part in (rows[1:4], rows[4:5]))
         T = np.vstack([np.column_stack([R.reshape(3, 3), t]), (0, 0, 0, 1)])
         E = np.linalg.inv(rigid(T, "R, t")) @ OPENGL_FROM_OPENCV
         camera = central_camera(f, f, stored_size(frame.image, frame.name), (k1, k2, 0.0, 0.0))
-        return Candidate(replace(frame, E=E), camera)
+        return posed(frame, E, camera)
 
     blocks = [[next(lines, "") for _ in range(5)] for _ in names]
-    return Layout("Bundler", None, images.candidates(build, blocks), notes=images.notes)
+    return images.layout("Bundler", blocks, build)
 
 
 def read_nvm(path: Path, images_at: Path | None = None) -> Layout | None:
-    """VisualSFM's NVM: a line an image, with its focal length, world-to-camera quaternion and centre."""
+    """Read VisualSFM's NVM: one line per image with focal length, world-to-camera quaternion and centre."""
     for file in files_of(path, "*.nvm"):
         with file.open(encoding="utf-8", errors="replace") as opened:
             if opened.readline().startswith("NVM_V3"):
@@ -269,10 +276,9 @@ def _nvm(file: Path, lines: Iterator[str], images_at: Path | None) -> Layout:
     def build(frame: CaptureFrame, words: str) -> Candidate:
         f, qw, qx, qy, qz, *place, k, _ = array_of(words.split(), (10,), "the numbers of an image")
         turn = Rotation.from_quat([qx, qy, qz, qw]).inv()
-        # VisualSFM straightens by r (1 + k r^2); this is its inverse, as a series.
+        # VisualSFM undistorts by r (1 + k r^2); this is the series of the inverse.
         lens = (-k, 3 * k**2, 0.0, 0.0, -12 * k**3)
         camera = central_camera(f, f, stored_size(frame.image, frame.name), lens)
-        return Candidate(replace(frame, E=pose_of(turn, place)), camera)
+        return posed(frame, pose_of(turn, place), camera)
 
-    candidates = images.candidates(build, (row[-1] for row in rows))
-    return Layout("VisualSFM", None, candidates, notes=images.notes)
+    return images.layout("VisualSFM", (row[-1] for row in rows), build)

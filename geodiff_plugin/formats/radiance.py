@@ -1,4 +1,4 @@
-"""Inputs and results of programs for radiance fields and splats; none has a unit.
+"""Reads inputs and results of programs for radiance fields and splats; none has a unit.
 
 Source: ``utils/camera_utils.py`` (``camera_to_JSON``) of graphdeco-inria/gaussian-splatting;
 ``llff/poses/pose_utils.py`` of Fyusion/LLFF; ``models/dataset.py`` of Totoro97/NeuS;
@@ -9,37 +9,43 @@ Source: ``utils/camera_utils.py`` (``camera_to_JSON``) of graphdeco-inria/gaussi
 from __future__ import annotations
 
 import json
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.formats.files import read_matrix, read_npy, read_text
 from geodiff_plugin.formats.image_files import IMAGE_FOLDERS, files_of, image_folders, images_in
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, build_frame
-from geodiff_plugin.formats.rigs import Camera, array_of, central_camera, intrinsics, rigid, transform
+from geodiff_plugin.formats.layouts import (
+    CameraPerImage,
+    Candidate,
+    CaptureFrame,
+    Images,
+    Layout,
+    paired,
+    posed,
+)
+from geodiff_plugin.formats.rigs import RawCamera, array_of, central_camera, intrinsics, rigid, transform
 from geodiff_plugin.formats.storage import text_of_npz
 
-#: Entries of every camera of 3D Gaussian splatting's ``cameras.json``.
+#: Keys of every camera in 3D Gaussian splatting's ``cameras.json``.
 OF_SPLATS = {"img_name", "position", "rotation", "fx", "fy", "width", "height"}
 POSES_BOUNDS = "poses_bounds.npy"
-#: Numbers of LLFF's rows: a 3x4 pose beside height, width and focal length, and the bounds of the depth.
+#: Number of values per row of LLFF: a 3x4 pose with height, width and focal length, and depth bounds.
 LLFF_ROW = 17
-#: What NeuS, IDR and their successors call the file of cameras, and the folder of images.
+#: Names of the camera file of NeuS, IDR and their successors, and of the image folder.
 NEUS_FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 NEUS_IMAGES = ("image", "images", "rgb")
-#: Nerfies' folders of images, the largest first.
+#: Nerfies' image folders, the largest first.
 NERFIES_IMAGES = ("rgb/1x", "rgb/2x", "rgb/4x", "rgb/8x", "rgb/16x")
 OF_NERFIES = {"orientation", "position", "focal_length", "principal_point", "image_size"}
 Entries = dict[str, Any]
 
 
 def read_splat_cameras(path: Path, images_at: Path | None = None) -> Layout | None:
-    """``cameras.json`` beside a result of 3D Gaussian splatting: camera-to-world, central cameras."""
+    """Read ``cameras.json`` of a 3D Gaussian splatting result: camera-to-world, central cameras."""
     for file in files_of(path, "cameras*.json"):
         data = json.loads(read_text(file, "PATH"))
         if isinstance(data, list) and data and all(set(each) >= OF_SPLATS for each in data):
@@ -55,41 +61,37 @@ def _splat_cameras(file: Path, data: list[Entries], images_at: Path | None) -> L
         R = array_of(entries["rotation"], (3, 3), "rotation")
         E = transform(R, array_of(entries["position"], (3,), "position"), "a pose")
         size = entries["width"], entries["height"]
-        return Candidate(replace(frame, E=E), central_camera(entries["fx"], entries["fy"], size))
+        return posed(frame, E, central_camera(entries["fx"], entries["fy"], size))
 
-    return Layout("3D Gaussian splatting", None, images.candidates(build, data), notes=images.notes)
+    return images.layout("3D Gaussian splatting", data, build)
 
 
 def read_llff(path: Path) -> Layout | None:
-    """LLFF's ``poses_bounds.npy`` and its images, in the order of their names; central cameras."""
+    """Read LLFF's ``poses_bounds.npy`` and its images in order of their names; central cameras."""
     file = path if path.name == POSES_BOUNDS else path / POSES_BOUNDS
     if not file.is_file():
         return None
     rows = read_npy(file, "PATH", f"{POSES_BOUNDS} of LLFF").astype(np.float64)
     if rows.ndim != 2 or rows.shape[1] != LLFF_ROW:
-        bad_value(POSES_BOUNDS, f"of rows of {LLFF_ROW} numbers", f"shape {rows.shape} in {file}")
+        bad_value(POSES_BOUNDS, f"an array with rows of {LLFF_ROW} numbers", f"shape {rows.shape} in {file}")
     places = [images_in(file.parent / name) for name in IMAGE_FOLDERS]
     images = next((images for images in places if len(images) == len(rows)), None)
     if images is None:
         counts = ", ".join(str(len(images)) for images in places if images) or "none"
-        cure = f"Its poses have no names: {IMAGE_FOLDERS[0]}/ must hold those images, and no other."
-        bad_value(POSES_BOUNDS, f"of as many rows as there are images ({counts})", f"{len(rows)}", cure)
+        hint = f"Its poses have no names, so {IMAGE_FOLDERS[0]}/ must contain exactly those images."
+        bad_value(POSES_BOUNDS, f"an array with one row per image ({counts})", f"{len(rows)}", hint)
 
     def build(frame: CaptureFrame, row: np.ndarray) -> Candidate:
         down, right, back, place, (height, width, focal) = row[:15].reshape(3, 5).T
         E = transform(np.column_stack([right, down, -back]), place, "a pose")
-        return Candidate(replace(frame, E=E), central_camera(focal, focal, (int(width), int(height))))
+        return posed(frame, E, central_camera(focal, focal, (int(width), int(height))))
 
-    # In the order in which numpy sorted the names, as text.
-    pairs = zip(sorted(images, key=lambda image: image.name), rows, strict=True)
-    candidates = [
-        build_frame(CaptureFrame(image.stem, image), partial(build, row=row)) for image, row in pairs
-    ]
-    return Layout("LLFF", None, candidates)
+    # numpy's order of the names as text
+    return Layout("LLFF", None, paired(sorted(images, key=_name), rows, build))
 
 
 def read_neus(path: Path) -> Layout | None:
-    """Cameras of NeuS and IDR: a projection ``world_mat_I`` for image I of ``image/``."""
+    """Read cameras of NeuS and IDR: a projection ``world_mat_I`` for image I of ``image/``."""
     file = next((at for name in NEUS_FILES if (at := path / name).is_file()), None)
     file = path if path.name in NEUS_FILES else file
     places = [] if file is None else [*(file.parent / name for name in NEUS_IMAGES), file.parent]
@@ -102,17 +104,13 @@ def read_neus(path: Path) -> Layout | None:
         P = array_of(matrices[f"world_mat_{number}"], (4, 4), f"world_mat_{number}")[:3]
         K, R, centre = cv2.decomposeProjectionMatrix(P * np.sign(np.linalg.det(P[:, :3])))[:3]
         E = transform(R.T, centre[:3] / centre[3], "a pose")
-        return Candidate(replace(frame, E=E), Camera(K / K[2, 2]))
+        return posed(frame, E, RawCamera(K / K[2, 2]))
 
-    candidates = [
-        build_frame(CaptureFrame(image.stem, image), partial(build, number=number))
-        for number, image in enumerate(sorted(images, key=lambda image: image.name))
-    ]
-    return Layout("NeuS", None, candidates)
+    return Layout("NeuS", None, paired(sorted(images, key=_name), range(len(images)), build))
 
 
 def read_sdfstudio(path: Path, images_at: Path | None = None) -> Layout | None:
-    """SDFStudio's ``meta_data.json``: camera-to-world poses in OpenCV's axes, of a scene that was scaled."""
+    """Read SDFStudio's ``meta_data.json``: camera-to-world poses in OpenCV's axes, of a scaled scene."""
     for file in files_of(path, "meta_data.json"):
         data = json.loads(read_text(file, "PATH"))
         frames = data.get("frames") if isinstance(data, dict) else None
@@ -127,32 +125,20 @@ def _sdfstudio(file: Path, data: Entries, images_at: Path | None) -> Layout:
 
     def build(frame: CaptureFrame, entries: Entries) -> Candidate:
         K = array_of([row[:3] for row in entries["intrinsics"][:3]], (3, 3), "intrinsics")
-        K[:2, 2] -= 0.5  # nerfstudio has the centre of the first pixel at (0.5, 0.5)
+        K[:2, 2] -= 0.5  # nerfstudio's first pixel has its centre at (0.5, 0.5)
         E = rigid(np.ravel(entries["camtoworld"]), "camtoworld")
-        return Candidate(replace(frame, E=E), Camera(K, (data["width"], data["height"])))
+        return posed(frame, E, RawCamera(K, (data["width"], data["height"])))
 
-    return Layout("SDFStudio", None, images.candidates(build, frames), notes=images.notes)
-
-
-def read_nerfies(path: Path) -> Layout | None:
-    """Folders of Nerfies, HyperNeRF and DyCheck: ``camera/NAME.json`` of ``rgb/1x/NAME.png``."""
-    images = next(filter(None, (images_in(path / name) for name in NERFIES_IMAGES)), [])
-    files = [path / "camera" / f"{image.stem}.json" for image in images]
-    if not any(file.is_file() for file in files):
-        return None
-    candidates = [
-        build_frame(CaptureFrame(image.stem, image), partial(_nerfies_frame, file=file))
-        for image, file in zip(images, files, strict=True)
-    ]
-    return Layout("Nerfies", None, candidates)
+    return images.layout("SDFStudio", frames, build)
 
 
-def _nerfies_frame(frame: CaptureFrame, file: Path) -> Candidate:
-    entries = json.loads(read_text(file, f"the camera of {frame.name}"))
+def nerfies_camera(text: str, name: str) -> tuple[np.ndarray, RawCamera]:
+    """Read a JSON of Nerfies, HyperNeRF or DyCheck, with a world-to-camera rotation."""
+    entries = json.loads(text)
     missing = OF_NERFIES - set(entries)
     if missing:
-        bad_value(f"the camera of {frame.name}", "one of Nerfies", f"no {', '.join(sorted(missing))}")
-    R = array_of(entries["orientation"], (3, 3), "orientation")  # from the world to the camera
+        bad_value(name, "a camera of Nerfies", f"no {', '.join(sorted(missing))}")
+    R = array_of(entries["orientation"], (3, 3), "orientation")
     E = transform(R.T, array_of(entries["position"], (3,), "position"), "a pose")
     fx = float(entries["focal_length"])
     # The corner of the first pixel is at (0, 0).
@@ -162,30 +148,38 @@ def _nerfies_frame(frame: CaptureFrame, file: Path) -> Candidate:
     radial = entries.get("radial_distortion") or (0.0, 0.0, 0.0)
     tangential = entries.get("tangential_distortion", entries.get("tangential")) or (0.0, 0.0)
     lens = (radial[0], radial[1], tangential[0], tangential[1], radial[2])
-    return Candidate(replace(frame, E=E), Camera(K, entries["image_size"], lens))
+    return E, RawCamera(K, entries["image_size"], lens)
+
+
+#: ``camera/NAME.json`` for ``rgb/1x/NAME.png``, or a smaller copy.
+NERFIES = CameraPerImage(
+    "Nerfies", None, tuple((f"{folder}/*", "camera/{}.json") for folder in NERFIES_IMAGES), nerfies_camera
+)
 
 
 def read_nsvf(path: Path) -> Layout | None:
-    """NSVF's and NeRF++'s folders: ``rgb/``, ``pose/`` (camera-to-world), ``intrinsics.txt`` or a folder."""
-    images = sorted(images_in(path / "rgb"), key=lambda image: image.name)
+    """Read NSVF and NeRF++: ``rgb/``, ``pose/`` (camera-to-world), ``intrinsics.txt`` or a folder."""
+    images = sorted(images_in(path / "rgb"), key=_name)
     poses, each = _texts(path / "pose"), _texts(path / "intrinsics")
     one = path / "intrinsics.txt"
     if not (images and poses and (each or one.is_file())):
         return None
     same = [image.stem for image in images] == [pose.stem for pose in poses]
     if len(images) != len(poses):
-        cure = "Images and poses of NSVF belong together in the order of their names."
-        bad_value("pose/", f"of {len(images)} files, one for each image of rgb/", f"{len(poses)}", cure)
+        hint = "NSVF matches images and poses in order of their names."
+        bad_value("pose/", f"a folder of {len(images)} files, one per image in rgb/", f"{len(poses)}", hint)
     lenses = {file.stem: file for file in each}
 
     def build(frame: CaptureFrame, pose: Path) -> Candidate:
         lens = lenses.get(frame.name, one) if same else one
         E = rigid(read_matrix(pose, pose.name), pose.name)
-        return Candidate(replace(frame, E=E), Camera(read_matrix(lens, lens.name)[:3, :3]))
+        return posed(frame, E, RawCamera(read_matrix(lens, lens.name)[:3, :3]))
 
-    pairs = zip(images, poses, strict=True)
-    candidates = [build_frame(CaptureFrame(image.stem, image), partial(build, pose=p)) for image, p in pairs]
-    return Layout("NSVF", None, candidates)
+    return Layout("NSVF", None, paired(images, poses, build))
+
+
+def _name(image: Path) -> str:
+    return image.name
 
 
 def _texts(folder: Path) -> list[Path]:

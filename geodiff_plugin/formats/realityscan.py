@@ -1,35 +1,41 @@
-"""RealityScan (RealityCapture): a ``.xmp`` beside each image, with its pose and camera; no unit.
+"""Reads RealityScan (RealityCapture): one ``.xmp`` per image, with pose and camera; no unit.
 
-Source: the description of its camera math by its makers: S3 (normalised coordinates, 35 mm equivalent), S4
-(lenses), appendix B (XMP files). ``xcr:Rotation`` is from the world to the camera, ``xcr:Position`` the place
-of the camera; the corner of the first pixel is at (0, 0).
+Source: its developers' description of the camera model: S3 (normalised coordinates, 35 mm equivalent), S4
+(lenses), appendix B (XMP files). ``xcr:Rotation`` is world-to-camera, ``xcr:Position`` the camera position;
+the corner of the first pixel is at (0, 0).
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.formats.files import parse_xml, read_text, stored_size
 from geodiff_plugin.formats.image_files import images_in
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Layout, build_frame, largest_part_notes
-from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, transform
+from geodiff_plugin.formats.layouts import (
+    Candidate,
+    CaptureFrame,
+    Layout,
+    largest_part_findings,
+    paired,
+    posed,
+)
+from geodiff_plugin.formats.rigs import RawCamera, array_of, intrinsics, transform
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/1.1#"
-#: Millimetres of a film to which focal lengths are equivalent, along the longer side of the image.
+#: Film width in millimetres for equivalent focal lengths, along the longer side of the image.
 FILM_MM = 36.0
-#: Lens models with coefficients ``k1 k2 k3 k4 t1 t2``, the first two without; its division model is not read.
+#: Lens models with coefficients ``k1 k2 k3 k4 t1 t2`` (the first two: none); its division model is not
+#: supported.
 LENSES = ("none", "perspective", "brown3", "brown3t2", "brown4", "brown4t2")
 UNDISTORT = "In RealityScan: Export, Registration, with undistorted images and their XMP files."
-#: Entries of a sidecar by their names.
+#: Entries of a sidecar file by name.
 Entries = dict[str, str]
 
 
 def read_realityscan(path: Path) -> Layout | None:
-    """Images with RealityScan's sidecars beside them; those of the largest component."""
+    """Read images with RealityScan's sidecar files, of the largest component."""
     for folder in (path, path / "images", path / "input"):
         sidecars = [(image, file) for image in images_in(folder) if (file := _sidecar(image)) is not None]
         found = [(image, _entries(file)) for image, file in sidecars]
@@ -45,7 +51,7 @@ def _sidecar(image: Path) -> Path | None:
 
 
 def _entries(file: Path) -> Entries:
-    """RealityScan's entries of a file, attributes or elements; none of another program's."""
+    """Return RealityScan's entries of a file, attributes or elements; empty for other programs' files."""
     text = read_text(file, f"{file}")
     if NAMESPACE not in text:
         return {}
@@ -59,13 +65,9 @@ def _entries(file: Path) -> Entries:
 def _realityscan(images: list[tuple[Path, Entries]]) -> Layout:
     largest_first = Counter(entries.get("ComponentId", "") for _, entries in images).most_common()
     component, _ = largest_first[0]
-    notes = largest_part_notes("component", [count for _, count in largest_first])
-    candidates = [
-        build_frame(CaptureFrame(image.stem, image), partial(_frame, entries=entries))
-        for image, entries in images
-        if entries.get("ComponentId", "") == component
-    ]
-    return Layout("RealityScan", None, candidates, notes=notes)
+    findings = largest_part_findings("component", [count for _, count in largest_first])
+    taken = {image: entries for image, entries in images if entries.get("ComponentId", "") == component}
+    return Layout("RealityScan", None, paired(taken, taken.values(), _frame), findings=findings)
 
 
 def _frame(frame: CaptureFrame, entries: Entries) -> Candidate:
@@ -74,23 +76,34 @@ def _frame(frame: CaptureFrame, entries: Entries) -> Candidate:
         return Candidate(frame, camera)
     R = array_of(entries["Rotation"].split(), (3, 3), "xcr:Rotation")
     place = array_of(entries["Position"].split(), (3,), "xcr:Position")
-    return Candidate(replace(frame, E=transform(R.T, place, "xcr:Rotation")), camera)
+    return posed(frame, transform(R.T, place, "xcr:Rotation"), camera)
 
 
-def _camera(entries: Entries, size: tuple[int, int]) -> Camera:
+def _camera(entries: Entries, size: tuple[int, int]) -> RawCamera:
+    """Convert the camera of a sidecar file, whose lengths are relative to the longer side of the image."""
     skew, aspect = (float(entries.get(name, default)) for name, default in (("Skew", 0), ("AspectRatio", 1)))
     if skew or aspect != 1:
-        bad_value("a camera of RealityScan", "of square pixels", f"skew {skew}, aspect {aspect}", UNDISTORT)
+        bad_value(
+            "a camera of RealityScan",
+            "a camera with square pixels",
+            f"skew {skew}, aspect {aspect}",
+            UNDISTORT,
+        )
     longer = max(size)
     u, v = (float(entries.get(f"PrincipalPoint{axis}", 0)) * longer for axis in "UV")
     f = float(entries["FocalLength35mm"]) / FILM_MM * longer
     K = intrinsics(f, f, size[0] / 2 + u - 0.5, size[1] / 2 + v - 0.5)
+    return RawCamera(K, size, _distortion(entries))
+
+
+def _distortion(entries: Entries) -> tuple[float, ...]:
+    """Return the distortion coefficients in OpenCV's order; empty for a lens without distortion."""
     model = entries.get("DistortionModel", "none")
     numbers = array_of(entries.get("DistortionCoeficients", "0 0 0 0 0 0").split(), (6,), "its lens")
     if model in LENSES[:2] or not numbers.any():
-        return Camera(K, size)
+        return ()
     k1, k2, k3, k4, t1, t2 = numbers
     if model not in LENSES or k4:
         bad_value("a lens of RealityScan", f"one of {', '.join(LENSES)} without k4", model, UNDISTORT)
-    # Its tangential coefficients change places in OpenCV's order.
-    return Camera(K, size, (k1, k2, t2, t1, k3))
+    # Its tangential coefficients are swapped in OpenCV's order.
+    return k1, k2, t2, t1, k3

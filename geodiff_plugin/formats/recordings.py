@@ -1,4 +1,4 @@
-"""Videos, read by OpenCV, and bags: of ROS by ``rosbags`` (extra ``ros``), of protobuf by ``foxglove``."""
+"""Reads videos with OpenCV, and bags: ROS with ``rosbags`` (extra ``ros``), protobuf with ``foxglove``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import bisect
 import os
 import struct
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
@@ -14,53 +14,87 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import yaml
 
-from geodiff_plugin._checks import InputError, InputFileError, bad_value, refuse
+from geodiff_plugin._internal.checks import InputError, InputFileError, bad_value, raise_input_error
 from geodiff_plugin.formats.bag_images import CODED, DECODE_CODED, both_as_01, decode_image
-from geodiff_plugin.formats.depth import depth_mm
 from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.foxglove import ROS_PROFILES, FoxgloveReader, profile_of
+from geodiff_plugin.formats.ros_messages import (
+    CAMERA_INFO,
+    IMAGE,
+    camera_info_message,
+    camera_info_text,
+    depth_values,
+    image_message,
+    sigma_values,
+)
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 BAG_SUFFIXES = (".mcap", ".bag")
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file is named as a video is."""
+    """Whether a file has the suffix of a video."""
     return path.suffix.lower() in VIDEOS
 
 
 def _open_video(path: Path, name: str) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(check_file(path, name, "a video file")))
     if not capture.isOpened():
-        bad_value(name, "a video that OpenCV reads", path, "Convert it, or extract its frames into a folder.")
+        bad_value(
+            name, "a video that OpenCV can read", path, "Convert it, or extract its frames into a folder."
+        )
     return capture
 
 
 class VideoFacts(NamedTuple):
-    """What a video file holds."""
+    """Number, rate, size and times of a video's frames."""
 
     frames: int
-    fps: float  # frames a second
+    fps: float  # mean, frames per second
     size: tuple[int, int]  # (width, height)
+    times: tuple[float, ...]  # seconds of every frame from the first one
 
 
-def video_facts(path: Path, name: str = "video") -> VideoFacts:
-    """What a video holds; its frames are counted by going through them, as heads are not reliable."""
-    capture, count = _open_video(path, name), 0
+#: Deviation of container times from a constant rate that is due to rounding, seconds.
+ROUNDED_TIME_S = 0.0015
+
+
+def video_facts(
+    path: Path, name: str = "video", see: Callable[[float, np.ndarray], bool] | None = None
+) -> VideoFacts:
+    """Return facts of a video; counts frames by decoding, because headers are unreliable.
+
+    Calls ``see`` with the time in seconds and BGR pixels ``(H, W, 3)`` uint8 of each frame, until it returns
+    ``False``. Phones record at a variable rate, so the times are those in the container.
+    """
+    capture, times = _open_video(path, name), list[float]()
     while capture.grab():
-        count += 1
+        times.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0)
+        if see is not None and not see(times[-1], capture.retrieve()[1]):
+            see = None
     facts = (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
     fps, width, height = (capture.get(fact) for fact in facts)
     capture.release()
-    if count == 0:
-        bad_value(name, "a video with frames in it", f"{path}, which has none")
-    return VideoFacts(count, fps or 30.0, (int(width), int(height)))
+    if not times:
+        bad_value(name, "a video with frames", f"{path}, which has none")
+    fps = fps or 30.0
+    return VideoFacts(len(times), fps, (int(width), int(height)), _frame_times(times, fps))
+
+
+def _frame_times(times: Sequence[float], fps: float) -> tuple[float, ...]:
+    """Return the times in seconds from the first frame; at a constant rate, without rounding.
+
+    Some backends of OpenCV report no times. Then the rate is taken as constant.
+    """
+    given, even = np.asarray(times) - times[0], np.arange(len(times)) / fps
+    if not (np.diff(given) > 0).all() or np.abs(given - even).max() < ROUNDED_TIME_S:
+        return tuple(even.tolist())
+    return tuple(given.tolist())
 
 
 class VideoReader(AbstractContextManager["VideoReader"]):
-    """Frames of a video file, cheapest in order; a context manager."""
+    """Reads frames of a video file, fastest in order; a context manager."""
 
     def __init__(self, path: Path, name: str = "video") -> None:
         self._path, self._name = path, name
@@ -70,7 +104,7 @@ class VideoReader(AbstractContextManager["VideoReader"]):
         self._capture.release()
 
     def read(self, frame: int) -> np.ndarray:
-        """One frame, ``(H, W, 3)`` float32 in [0, 1], RGB, by its number from 0."""
+        """Read one frame by number from 0, ``(H, W, 3)`` float32 in [0, 1], RGB."""
         if frame < self._next:
             self._capture.release()
             self._capture, self._next = _open_video(self._path, self._name), 0
@@ -78,53 +112,58 @@ class VideoReader(AbstractContextManager["VideoReader"]):
             self._next += 1
         read, image = self._capture.read() if self._next == frame else (False, None)
         if not read:
-            raise InputFileError(f"frame {frame} of {self._path} does not decode.")
+            raise InputFileError(f"frame {frame} of {self._path} cannot be decoded.")
         self._next += 1
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255.0
 
 
-def both_halves(image_01: np.ndarray, name: str = "video") -> tuple[np.ndarray, np.ndarray]:
-    """Left and right view of a frame ``(H, 2 W, 3)`` that has them side by side, left one first."""
-    width = image_01.shape[1]
-    if width % 2:
-        cure = "Or give the right view's video as RIGHT."
-        bad_value(name, "both views side by side, so of even width", f"{width} pixels wide", cure)
-    left, right = map(np.ascontiguousarray, np.split(image_01, 2, axis=1))
-    return left, right
+def sample_frames(path: Path, count: int, samples: int) -> list[np.ndarray]:
+    """Read up to ``samples`` of a video's ``count`` frames, evenly spread, ``(H, W, 3)`` uint8 RGB.
+
+    Seeks, which is fast but may return a neighbouring frame.
+    """
+    capture, images = _open_video(path, "video"), []
+    for k in range(samples):
+        capture.set(cv2.CAP_PROP_POS_FRAMES, (2 * k + 1) * count // (2 * samples))
+        read, image = capture.read()
+        images += [cv2.cvtColor(image, cv2.COLOR_BGR2RGB)] if read else []
+    capture.release()
+    return images or [np.rint(VideoReader(path).read(0) * 255).astype(np.uint8)]
 
 
 class Stamp(NamedTuple):
-    """Time of a message, nanoseconds."""
+    """Times of a message in nanoseconds."""
 
-    header_ns: int  # by its header
+    header_ns: int  # in its header
     recorded_ns: int
 
 
 class BagFrame(NamedTuple):
     """Depth of one image of a bag."""
 
-    stamp: Stamp  # of the image
-    depth_m: np.ndarray  # (H, W) metres; 0, NaN or less where unknown
+    stamp: Stamp  # stamp of the image
+    depth_m: np.ndarray  # (H, W) metres; unknown where 0, negative or NaN
     K: np.ndarray  # (3, 3) pixels
+    sigma_m: np.ndarray | None = None  # (H, W) standard deviation of the depth, metres
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is named as a bag is, or is the folder of one."""
+    """Whether a path has the suffix of a bag, or is the folder of one."""
     return path.suffix in (*BAG_SUFFIXES, ".db3") or os.path.isfile(path / "metadata.yaml")
 
 
 def _open_bag(path: Path) -> Any:
     profile = profile_of(path)
     if profile == "ros1":
-        cure = "Give the .bag that it was made from, or record it by ROS 2."
-        bad_value("LEFT", "a .bag of ROS 1, or an MCAP file of ROS 2", f"{path}, an MCAP file of ROS 1", cure)
+        hint = "Pass the original .bag, or record with ROS 2."
+        bad_value("LEFT", "a .bag of ROS 1, or an MCAP file of ROS 2", f"{path}, an MCAP file of ROS 1", hint)
     if profile is not None and profile not in ROS_PROFILES:
         return FoxgloveReader(path)
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        refuse("Bags are read by rosbags. Run: pip install 'geodiff-plugin[ros]'.")
+        raise_input_error("Reading bags needs rosbags. Install it with: pip install 'geodiff-plugin[ros]'.")
     return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
 
@@ -133,7 +172,7 @@ def _connections(reader: Any, path: Path, topic: str) -> list[Any]:
     topics = sorted({connection.topic for connection in images})
     coded = {c.topic: c.msgtype for c in reader.connections if c.msgtype.endswith(CODED)}
     if topic in coded:
-        bad_value(topic, "a topic of single images", f"coded video ({coded[topic]})", DECODE_CODED)
+        bad_value(topic, "a topic of single images", f"compressed video ({coded[topic]})", DECODE_CODED)
     if topic not in topics:
         got = f"{path}, whose images are {', '.join(topics) or 'none'}"
         bad_value(topic, "a topic of images in the bag", got)
@@ -141,7 +180,7 @@ def _connections(reader: Any, path: Path, topic: str) -> list[Any]:
 
 
 def _header_ns(reader: Any, raw: Any) -> int:
-    """Nanoseconds in the header, which every message with an image begins with."""
+    """Return nanoseconds in the header, the first entry of every message with an image."""
     if isinstance(reader, FoxgloveReader):
         return reader.header_ns(raw)
     layout = "<4xII" if not reader.is2 or raw[1] & 1 else ">4xII"
@@ -151,7 +190,7 @@ def _header_ns(reader: Any, raw: Any) -> int:
 
 @lru_cache(maxsize=4)
 def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple[tuple[Stamp, Stamp], ...]:
-    """The stamps of the images that belong together, each right one to one left one, in order."""
+    """Return the stamps of matching images, one right image per left image, in order."""
     stamps: list[list[Stamp]] = []
     try:
         with _open_bag(path) as reader:
@@ -160,9 +199,9 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
                 stamps.append(sorted(Stamp(_header_ns(reader, raw), at) for _, at, raw in messages))
     except InputError:
         raise
-    except Exception as error:  # of any kind that a damaged bag leads to
-        said = str(error).partition("\n")[0] or type(error).__name__
-        bad_value("LEFT", "a whole bag", f"{path} ({said})", "Is it cut off?")
+    except Exception as error:  # any error that a damaged bag may cause
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        bad_value("LEFT", "a whole bag", f"{path} ({reason})", "It may be truncated.")
     pairs, free = [], stamps[1]
     for left in stamps[0]:
         at = bisect.bisect(free, left)
@@ -173,12 +212,14 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
             free.remove(near)
     if not pairs:
         got = f"{len(stamps[0])} and {len(stamps[1])} images, none within {tolerance_s:g} s of each other"
-        bad_value("--left, --right", "of images of the same moments", got, "Give a larger --tolerance.")
+        bad_value(
+            "--left-topic, --right-topic", "topics of simultaneous images", got, "Pass a larger --tolerance."
+        )
     return tuple(pairs)
 
 
 class BagReader(AbstractContextManager["BagReader"]):
-    """Both images of the pairs of ``list_pairs``, side by side as in a video; a context manager."""
+    """Reads both images of the pairs of ``list_pairs``, side by side as in a video; a context manager."""
 
     def __init__(self, path: Path, topics: tuple[str, str], tolerance_s: float) -> None:
         self._path, self._pairs, self._reader = path, list_pairs(path, topics, tolerance_s), _open_bag(path)
@@ -189,11 +230,13 @@ class BagReader(AbstractContextManager["BagReader"]):
         self._reader.close()
 
     def read(self, frame: int) -> np.ndarray:
-        """A pair, ``(H, 2 W, 3)`` float32 in [0, 1], RGB, left one first."""
+        """Read a pair, ``(H, 2 W, 3)`` float32 in [0, 1], RGB, left view first."""
+        if frame >= len(self._pairs):
+            raise InputFileError(f"{self._path} has no pair {frame}.")
         images = [self._image(*each) for each in zip(self._connections, self._pairs[frame], strict=True)]
         if images[0].shape != images[1].shape:
             sizes = " and ".join("{1}x{0}".format(*image.shape) for image in images)
-            raise InputFileError(f"pair {frame} of {self._path} must be of one size; got {sizes}.")
+            raise InputFileError(f"pair {frame} of {self._path} must have equal sizes; got {sizes}.")
         return np.hstack(both_as_01(images, self._path))
 
     def _image(self, connections: list[Any], stamp: Stamp) -> np.ndarray:
@@ -201,11 +244,11 @@ class BagReader(AbstractContextManager["BagReader"]):
         for connection, _, raw in self._reader.messages(connections, at, at + 1):
             if _header_ns(self._reader, raw) == stamp.header_ns:
                 return decode_image(self._reader.deserialize(raw, connection.msgtype), self._path)
-        raise InputFileError(f"the image of {stamp.header_ns} ns in {self._path} does not read.")
+        raise InputFileError(f"the image of {stamp.header_ns} ns in {self._path} cannot be read.")
 
 
 def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], str]:
-    """The ``camera_info`` beside two topics as files of ``read_ros``, and the left one's ``frame_id``."""
+    """Return the ``camera_info`` of two topics as files for ``read_ros``, and the left ``frame_id``."""
     texts, frames = [], []
     with _open_bag(path) as reader:
         for topic in topics:
@@ -214,23 +257,24 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
             named = [c for c in infos if c.topic in (f"{base}/camera_info", f"{base}/calibration")]
             first = next(reader.messages(named), None) if named else None
             if first is None:
-                cure = "Give --calib, or the cameras in another way."
-                bad_value("calibration", f"in the bag as {base}/camera_info, or given", "neither", cure)
+                hint = "Pass --calib or other camera options."
+                bad_value("calibration", f"in the bag as {base}/camera_info, or an option", "neither", hint)
             info = reader.deserialize(first[2], first[0].msgtype)
-            entries: dict[str, Any] = {"width": info.width, "height": info.height}
-            entries |= {"distortion_model": info.distortion_model, "rectified": "rect" in name}
-            for key in "DKRP":  # ROS 2 has them in small letters
-                entries[key] = np.array(getattr(info, key, getattr(info, key.lower(), ())), float).tolist()
-            texts.append(yaml.safe_dump(entries))
+            texts.append(camera_info_text(info, "rect" in name))
             frames.append(info.header.frame_id)
     return texts, frames[0]
 
 
+#: Topics of a depth bag and their message types.
+DEPTH_TOPICS = {"/depth/image": IMAGE, "/depth/camera_info": CAMERA_INFO, "/depth/sigma": IMAGE}
+
+
 def write_depth_bag(path: Path, frames: Iterable[BagFrame], frame_id: str, encoding: str) -> int:
-    """Write ``/depth/image`` and ``/depth/camera_info`` of all frames, whole or not at all; how many.
+    """Write ``/depth/image``, ``/depth/camera_info`` and ``/depth/sigma`` of all frames; return their number.
 
     ``path`` ends in .mcap (ROS 2) or .bag (ROS 1). ``"16UC1"`` is millimetres, 0 where unknown, ``"32FC1"``
-    metres, NaN where unknown.
+    metres, NaN where unknown. Standard deviations have the same encoding (``sigma_mm``); frames without them
+    have no ``/depth/sigma``.
     """
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
@@ -238,28 +282,31 @@ def write_depth_bag(path: Path, frames: Iterable[BagFrame], frame_id: str, encod
     is_ros2, count = path.suffix != ".bag", 0
     store: Any = get_typestore(Stores.ROS2_HUMBLE if is_ros2 else Stores.ROS1_NOETIC)
     plugin: dict[str, Any] = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
-    kinds = {"/depth/image": "sensor_msgs/msg/Image", "/depth/camera_info": "sensor_msgs/msg/CameraInfo"}
-    image_of, camera_of = (store.types[kind] for kind in kinds.values())
     serialize = store.serialize_cdr if is_ros2 else store.serialize_ros1
-    roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        made = Path(folder) / "depth"
+        made, topics = Path(folder) / "depth", dict[str, Any]()
         writer: Any = rosbag2.Writer(made, **plugin) if is_ros2 else rosbag1.Writer(made)
         with writer:
-            topics = [writer.add_connection(name, kind, typestore=store) for name, kind in kinds.items()]
-            for stamp, depth_m, K in frames:
+            for frame in frames:
                 count += 1
-                time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp.header_ns, 1_000_000_000))
-                order = {} if is_ros2 else {"seq": 0}
-                header = store.types["std_msgs/msg/Header"](**order, stamp=time, frame_id=frame_id)
-                values = np.where(depth_m > 0, depth_m, np.nan).astype("<f4")
-                values = depth_mm(values) if encoding == "16UC1" else values
-                size, data = values.shape, np.ascontiguousarray(values).view(np.uint8).ravel()
-                image = image_of(header, *size, encoding, 0, values.strides[0], data)
-                P = np.column_stack([K, np.zeros(3)])
-                matrices = [m.astype(np.float64).ravel() for m in (np.zeros(5), K, np.eye(3), P)]
-                camera = camera_of(header, *size, "plumb_bob", *matrices, 0, 0, roi)
-                for topic, message in zip(topics, (image, camera), strict=True):
-                    writer.write(topic, stamp.recorded_ns, serialize(message, message.__msgtype__))
+                for name, message in _depth_messages(store.types, frame, frame_id, encoding).items():
+                    if name not in topics:
+                        topics[name] = writer.add_connection(name, DEPTH_TOPICS[name], typestore=store)
+                    data = serialize(message, message.__msgtype__)
+                    writer.write(topics[name], frame.stamp.recorded_ns, data)
         os.replace(made / "depth.mcap" if is_ros2 else made, path)
     return count
+
+
+def _depth_messages(types: Any, frame: BagFrame, frame_id: str, encoding: str) -> dict[str, Any]:
+    """Return the messages of a frame by topic, all with the stamp of its image."""
+    time = types["builtin_interfaces/msg/Time"](*divmod(frame.stamp.header_ns, 1_000_000_000))
+    header_of = types["std_msgs/msg/Header"]
+    order = {"seq": 0} if "seq" in header_of.__dataclass_fields__ else {}  # ROS 1 only
+    header = header_of(**order, stamp=time, frame_id=frame_id)
+    images = {"/depth/image": depth_values(frame.depth_m, encoding)}
+    if frame.sigma_m is not None:
+        images["/depth/sigma"] = sigma_values(frame.sigma_m, encoding)
+    messages = {name: image_message(types, header, each, encoding) for name, each in images.items()}
+    size = frame.depth_m.shape[::-1]
+    return messages | {"/depth/camera_info": camera_info_message(types, header, frame.K, size)}

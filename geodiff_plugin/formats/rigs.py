@@ -1,4 +1,4 @@
-"""Two cameras as a calibration file describes them, and ``make_rig``, which checks and builds."""
+"""Describes two cameras of a calibration file; ``make_rig`` checks them and builds a ``Rig``."""
 
 from __future__ import annotations
 
@@ -16,18 +16,26 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._camera_checks import check_intrinsics, check_pose
-from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_positive, refuse
-from geodiff_plugin.types import Distortion, Rig
+from geodiff_plugin._internal.camera_checks import check_intrinsics, check_pose
+from geodiff_plugin._internal.checks import (
+    NEGATIVE_BASELINE,
+    InputError,
+    InputFileError,
+    bad_value,
+    check_baseline_m,
+    check_positive,
+    raise_input_error,
+)
+from geodiff_plugin.cameras import Camera, Distortion, Size
+from geodiff_plugin.types import Rig
 
-Size = tuple[int, int]
 Entry = TypeVar("Entry")
 
-#: Coefficients below this move no pixel of a 12 megapixel image by a tenth of a pixel.
+#: Coefficients below this value displace no pixel of a 12 megapixel image by a tenth of a pixel.
 DISTORTION_TOLERANCE = 1e-6
-#: Images of one sensor differ in their ratio of sides by rounding only; beyond this one of them was cropped.
+#: Relative tolerance of aspect ratios: rounding stays below it, cropping exceeds it.
 RATIO_TOLERANCE = 0.01
-#: What files call the lenses that OpenCV has, in small letters -> the model's name in ``Distortion``.
+#: Names of OpenCV's lens models in files, in lower case -> name of the model in ``Distortion``.
 LENS_MODELS = {
     **{"": "opencv", "cameratype 0": "opencv", "cameratype 1": "fisheye"},
     **dict.fromkeys("opencv pinhole simple_pinhole none brownconrady".split(), "opencv"),
@@ -40,7 +48,7 @@ LENS_MODELS = {
     **dict.fromkeys("simple_fisheye simple_radial_fisheye radial_fisheye".split(), "fisheye"),
 }
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
-#: Models of COLMAP that OpenCV does not have, and how many coefficients each has; pycolmap removes them.
+#: COLMAP models that OpenCV lacks, with their number of coefficients; undistorted with pycolmap.
 COLMAP_LENSES = {
     "FOV": 1,
     "THIN_PRISM_FISHEYE": 8,
@@ -54,7 +62,7 @@ CHECK_FILE = "Check the calibration file."
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """Which two cameras of a file with more than two, and at which resolution; as in ``read_calibration``."""
+    """Selects two cameras of a file with more than two, and the resolution; see ``read_calibration``."""
 
     cameras: tuple[int, int] | None = None
     image_folder_hint: str | None = None
@@ -64,10 +72,11 @@ class CameraChoice:
 
 
 @dataclass(frozen=True)
-class Camera:
-    """One camera as a file describes it, in numbers or text; the first pixel's centre is at (0, 0).
+class RawCamera:
+    """One camera as described by a file, in numbers or text; the centre of the first pixel is at (0, 0).
 
-    ``coefficients`` of the lens are in OpenCV's order; ``model`` is what the file calls it.
+    ``K`` is ``None`` if unknown. ``coefficients`` of the lens are in OpenCV's order; ``model`` is its name in
+    the file.
     """
 
     K: Any
@@ -80,12 +89,12 @@ class Camera:
 class CalibrationFormat:
     """One entry of ``CALIBRATION_FORMATS``; ``summary`` names it in messages.
 
-    ``mark`` is a regular expression that its texts have, and none of a format before it; ``^`` begins a line.
-    ``read`` makes the rig of the texts by ``make_rig``, and may raise whatever a missing entry raises. Files
-    may be as many as ``file_counts`` says, hold more than two cameras (``uses_cameras``), or a pose in no
-    known unit for each of many images (``by_image``), or cameras of the pixels as image files store them, not
-    as EXIF turns them (``as_stored``). ``beside`` gives the names of files in the folder of the one that was
-    given, whose texts ``read`` takes too.
+    ``mark`` is a regular expression that matches its texts, and no text of earlier formats; ``^`` matches at
+    line starts. ``read`` builds the rig with ``make_rig``, and may raise any error of a missing entry.
+    ``file_counts`` is the allowed number of files. Files may have more than two cameras (``uses_cameras``), a
+    pose without a known unit per image (``by_image``), or cameras of the pixels as stored, before EXIF
+    orientation (``as_stored``). ``companions`` returns the names of further files in the same folder, whose
+    texts ``read`` takes too.
     """
 
     summary: str
@@ -95,11 +104,11 @@ class CalibrationFormat:
     uses_cameras: bool = False
     by_image: bool = False
     as_stored: bool = False
-    beside: Callable[[str], list[str]] | None = None
+    companions: Callable[[str], list[str]] | None = None
 
 
 def is_cut_off(text: str) -> bool:
-    """Whether a text ends in the middle: a bracket or the last line is not closed."""
+    """Whether a text is truncated: a bracket or the last line is not closed."""
     opened = sum(text.count(bracket) for bracket in "[{")
     closed = sum(text.count(bracket) for bracket in "]}")
     unfinished = "\n" in text and not text.endswith(("\n", "}", "]", ">"))
@@ -107,40 +116,42 @@ def is_cut_off(text: str) -> bool:
 
 
 def _ended_early(error: Exception) -> bool:
-    """Whether a text ended before what was read of it did."""
+    """Whether an error indicates a truncated text."""
     if isinstance(error, json.JSONDecodeError):
         return error.pos >= len(error.doc.rstrip())
-    return isinstance(error, (yaml.MarkedYAMLError, EOFError, ElementTree.ParseError))  # others are named
+    return isinstance(
+        error, (yaml.MarkedYAMLError, EOFError, ElementTree.ParseError)
+    )  # other errors state the cause
 
 
 @contextmanager
-def reading_whole(
-    source: object, summary: str, *texts: str, cure: str = "Is it of another program?"
+def reading_file(
+    source: object, summary: str, *texts: str, hint: str = "Check that it is the right kind of file."
 ) -> Iterator[None]:
-    """Whatever is wrong in the files that are read inside becomes a sentence with their names.
+    """Convert any error of reading files inside the block to a message with their names.
 
-    Only where one of their ``texts`` ends in the middle the sentence asks whether it was cut off.
+    The hint asks about truncation only if one of ``texts`` is truncated.
     """
     try:
         yield
     except InputFileError:
         raise
     except InputError as error:
-        refuse(f"{source}: {error}")
-    except Exception as error:  # of any kind that a damaged file leads to
+        raise_input_error(f"{source}: {error}")
+    except Exception as error:  # any error that a damaged file may cause
         got = str(error) if isinstance(error, ValueError) else "other entries"
         got = f"no {error}" if isinstance(error, KeyError) else got
         cut = _ended_early(error) or any(map(is_cut_off, texts))
-        bad_value(str(source), f"a whole {summary}", got, "Is the file cut off?" if cut else cure)
+        bad_value(str(source), f"a whole {summary}", got, "The file seems truncated." if cut else hint)
 
 
 def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Finite numbers, or text of them, as a float64 array of ``shape``; ``(-1,)`` takes any count."""
+    """Convert numbers or their text to a finite float64 array of ``shape``; ``(-1,)``: any count."""
     count = math.prod(shape)
     expected = {1: "a finite number"}.get(count, f"{count} finite numbers" if count > 0 else "finite numbers")
     try:
         numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):  # a whole number of any length is JSON
+    except (TypeError, ValueError, OverflowError):  # JSON allows integers of any length
         numbers = np.array(np.nan)
     if not np.isfinite(numbers).all():
         bad_value(name, expected, repr(value), CHECK_FILE)
@@ -150,65 +161,65 @@ def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def intrinsics(fx: Any, fy: Any, cx: Any, cy: Any) -> np.ndarray:
-    """The ``(3, 3)`` float64 camera matrix of four numbers in pixels."""
+    """Return the ``(3, 3)`` float64 camera matrix of four numbers in pixels."""
     fx, fy, cx, cy = array_of((fx, fy, cx, cy), (4,), "fx, fy, cx, cy")
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
 def rigid(matrix: Any, name: str) -> np.ndarray:
-    """A ``(4, 4)`` float64 transform of 12 or 16 numbers, its rotation projected to the nearest one."""
+    """Return a ``(4, 4)`` float64 transform of 12 or 16 numbers, with the nearest rotation."""
     numbers = array_of(matrix, (-1,), name)
     matrix = array_of(numbers, (3, 4) if numbers.size == 12 else (4, 4), name)
-    return check_pose(matrix, name, "Are rows and columns swapped, or is a scale multiplied in?")
+    return check_pose(matrix, name, "Check for swapped rows and columns, or a scale factor.")
 
 
 def transform(rotation: Any, translation: Any, name: str) -> np.ndarray:
-    """The ``(4, 4)`` float64 rigid transform of a rotation of 9 numbers, row by row, and a translation."""
+    """Return the ``(4, 4)`` float64 transform of a rotation (9 numbers, row-major) and a translation."""
     R = array_of(rotation, (3, 3), f"the rotation of {name}")
     return rigid(np.column_stack([R, array_of(translation, (3,), f"the translation of {name}")]), name)
 
 
 def pose_of(turn: Rotation, place: Any) -> np.ndarray:
-    """The ``(4, 4)`` pose of a rotation and a place."""
+    """Return the ``(4, 4)`` pose of a rotation and a position."""
     E = np.eye(4)
     E[:3, :3], E[:3, 3] = turn.as_matrix(), array_of(place, (3,), "a place")
     return E
 
 
-def central_camera(fx: float, fy: float, size: Size, coefficients: tuple[float, ...] = ()) -> Camera:
-    """A camera whose principal point is the middle of its image."""
-    return Camera(intrinsics(fx, fy, (size[0] - 1) / 2, (size[1] - 1) / 2), size, coefficients)
+def central_camera(fx: float, fy: float, size: Size, coefficients: tuple[float, ...] = ()) -> RawCamera:
+    """Return a camera with its principal point at the image centre."""
+    return RawCamera(intrinsics(fx, fy, (size[0] - 1) / 2, (size[1] - 1) / 2), size, coefficients)
 
 
-def resized(camera: Camera, size: Size, name: str, cure: str) -> Camera:
-    """The camera at another resolution of the whole image, which messages name; a crop is refused."""
+def resized(camera: RawCamera, size: Size, name: str, hint: str) -> RawCamera:
+    """Return the camera at another resolution of the whole image; raise with ``name`` if it is a crop."""
     width, height = camera.size or size
-    s_x, s_y = size[0] / width, size[1] / height
-    if abs(s_x / s_y - 1) > RATIO_TOLERANCE:
-        expected = f"of the shape of its camera's images ({width}x{height})"
-        bad_value(name, expected, "{}x{}".format(*size), cure)
-    scale = np.array([[s_x, 0, 0.5 * s_x - 0.5], [0, s_y, 0.5 * s_y - 0.5], [0, 0, 1]])
-    return replace(camera, K=scale @ camera.K, size=size)
+    if abs(size[0] / width / (size[1] / height) - 1) > RATIO_TOLERANCE:
+        expected = f"of the aspect ratio of its camera's images ({width}x{height})"
+        bad_value(name, expected, "{}x{}".format(*size), hint, code="calibration.size")
+    K = Camera(array_of(camera.K, (3, 3), f"K of {name}"), (width, height)).resized(size).K
+    return replace(camera, K=K, size=size)
 
 
 def of_size(by_size: Mapping[Size, Entry], choice: CameraChoice) -> Entry:
-    """What a file has for images of ``choice.image_size``, or all that it has where that is one."""
+    """Return the entry for images of ``choice.image_size``, or the only entry."""
     size = choice.image_size
     size = next(iter(by_size)) if size is None and len(by_size) == 1 else size
     if size is None or size not in by_size:
         sizes = ", ".join("{}x{}".format(*size) for size in sorted(by_size)) or "none"
-        got = "no image" if size is None else "{}x{}. A side-by-side image is two".format(*size)
-        bad_value("the left image", f"of one of the file's sizes ({sizes})", got)
+        got = "no image" if size is None else "{}x{}. A side-by-side image contains two images".format(*size)
+        bad_value("the left image", f"of a size in the file ({sizes})", got, code="calibration.size")
     return by_size[size]
 
 
 def two_cameras(
     choice: CameraChoice, available: Collection[int], default: tuple[int, int]
 ) -> tuple[int, int]:
-    """``choice.cameras``, else the default, as two different ones of those that a file has."""
+    """Return ``choice.cameras``, or the default, as two different cameras of the file."""
     if len(available) == 1:
-        cure = "Give the stereo calibration, in which one camera's pose is given beside the other's."
-        bad_value("the file", "of two cameras", "one of one camera", cure)
+        hint = "Pass the stereo calibration, which has the pose of one camera relative to the other."
+        expected = "a calibration of two cameras"
+        bad_value("the file", expected, "one camera", hint, code="calibration.one-camera")
     left, right = choice.cameras or default
     if left == right or not {left, right} <= set(available):
         have = ", ".join(map(str, sorted(available))) or "none"
@@ -217,29 +228,29 @@ def two_cameras(
 
 
 def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, str]:
-    """The names in a file of both images; they and the paths may lack folders, or a suffix."""
+    """Return the names of both images in a file; given names may omit folders or the suffix."""
     if choice.image_names is None:
-        bad_value("image_names", "given, as ('left.jpg', 'right.jpg'), for a file of many images", "none")
+        bad_value("image_names", "given for a file of many images, such as ('left.jpg', 'right.jpg')", "none")
     numbers = []
     for wanted in choice.image_names:
         in_common = {name: _parts_in_common(name, str(wanted)) for name in names}
-        most = max(in_common.values(), default=0)
-        fitting = sorted(name for name, count in in_common.items() if count == most)
-        if most == 0:
+        longest = max(in_common.values(), default=0)
+        fitting = sorted(name for name, count in in_common.items() if count == longest)
+        if longest == 0:
             expected = f"one of the {len(names)} in the file ({', '.join(sorted(names)[:3])}, ...)"
             bad_value("the image", expected, wanted, "Check its name.")
         if len(fitting) > 1:
             got = f"{wanted}, which may be {' and '.join(fitting[:2])}"
-            bad_value("the image", "one image of the file", got, "Add its folder.")
+            bad_value("the image", "one image of the file", got, "Include its folder.")
         numbers += fitting
     if numbers[0] == numbers[1]:
-        bad_value("the images", "two of those in the file", f"{numbers[0]} for both", "Check their names.")
+        bad_value("the images", "two images of the file", f"{numbers[0]} for both", "Check their names.")
     return numbers[0], numbers[1]
 
 
 def _parts_in_common(name: str, wanted: str) -> int:
-    """How many parts both paths have in common, if one of them ends the other; else 0."""
-    # Files of Windows programs have backslashes; a step upwards says nothing about the name.
+    """Return the number of parts that both paths share, if one is a suffix of the other; otherwise 0."""
+    # Files of Windows programs have backslashes; ".." is not part of the name.
     paths = (PurePath(text.replace("\\", "/")).parts for text in (name, wanted))
     ours, theirs = ([part for part in parts if part != ".."] for parts in paths)
     if ours and theirs and ours[-1] == PurePath(theirs[-1]).stem:  # NeRF's names have no suffix
@@ -249,22 +260,22 @@ def _parts_in_common(name: str, wanted: str) -> int:
 
 
 def is_distorted(lens: Distortion | None) -> bool:
-    """Whether a lens moves any pixel; others than OpenCV's first do with coefficients of zero as well."""
+    """Whether a lens displaces any pixel; some models do so even with zero coefficients."""
     if lens is None:
         return False
     return lens.model != "opencv" or np.abs(lens.coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
 
 
-def lens_of(camera: Camera, name: str) -> Distortion | None:
-    """The lens of a camera, which messages name; ``None`` where it moves no pixel."""
+def lens_of(camera: RawCamera, name: str) -> Distortion | None:
+    """Return the lens of a camera, ``None`` without distortion; errors use ``name``."""
     if camera.model in COLMAP_LENSES:
         return _colmap_lens(camera, name)
     model = LENS_MODELS.get(camera.model.lower(), "")
     if not model:
-        cure = "OpenCV does not have this model: undistort or rectify both images to a pinhole first."
-        bad_value(f"the lens model of {name}", "opencv or fisheye", camera.model, cure)
+        hint = "OpenCV lacks this model. Undistort or rectify both images first."
+        bad_value(f"the lens model of {name}", "opencv or fisheye", camera.model, hint)
     numbers = array_of(camera.coefficients, (-1,), f"the lens distortion of {name}")
-    if model == "fisheye" and not numbers[4:].any():  # lists may be filled up with zeros
+    if model == "fisheye" and not numbers[4:].any():  # lists may be padded with zeros
         numbers = numbers[:4]
     lens = Distortion(model, numbers)
     if not is_distorted(lens):
@@ -276,11 +287,11 @@ def lens_of(camera: Camera, name: str) -> Distortion | None:
     return lens
 
 
-def _colmap_lens(camera: Camera, name: str) -> Distortion:
-    """The lens of a model that only pycolmap has."""
+def _colmap_lens(camera: RawCamera, name: str) -> Distortion:
+    """Return the lens of a model that only pycolmap supports."""
     if find_spec("pycolmap") is None:
-        cure = "Run: pip install pycolmap, or undistort the images first (colmap image_undistorter)."
-        bad_value(f"the lens model of {name}", "opencv or fisheye without pycolmap", camera.model, cure)
+        hint = "Run: pip install pycolmap, or undistort the images first (colmap image_undistorter)."
+        bad_value(f"the lens model of {name}", "opencv or fisheye without pycolmap", camera.model, hint)
     count = COLMAP_LENSES[camera.model]
     return Distortion(camera.model, array_of(camera.coefficients, (count,), f"the lens distortion of {name}"))
 
@@ -294,48 +305,51 @@ def _pixels(size: Any, name: str) -> Size | None:
     return int(width), int(height)
 
 
-def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False) -> Rig:
-    """A ``Rig`` of raw numbers: finite, in the right form, with whole pixels and lenses that OpenCV has.
+def make_rig(left: RawCamera, right: RawCamera, pose: Any, *, rectified: bool = False) -> Rig:
+    """Build a checked ``Rig``: finite numbers, valid shapes, integer pixel sizes, supported lenses.
 
-    ``pose`` is the right camera's in the left camera's frame, ``(4, 4)`` metres, or the baseline of a right
-    camera that stands to the right. ``rectified`` images have no lens distortion.
+    ``pose`` is the right camera's pose in the left camera's frame, ``(4, 4)`` metres, or the baseline of a
+    camera to the right. ``rectified`` images have no lens distortion.
     """
     E = np.eye(4)
     if np.ndim(pose) == 0:
         E[0, 3] = array_of(pose, (), "the baseline")
         if E[0, 3] <= 0:
-            bad_value("the baseline", "above 0", E[0, 3], CHECK_FILE)
+            hint = NEGATIVE_BASELINE if E[0, 3] < 0 else CHECK_FILE
+            bad_value("the baseline", "positive", E[0, 3], hint, code="baseline.sign")
     else:
         E = array_of(pose, (4, 4), "the pose")
-    cameras = (("the left camera", left), ("the right camera", right))
-    Ks = [check_intrinsics(array_of(c.K, (3, 3), f"K of {name}"), f"K of {name}") for name, c in cameras]
-    sizes = [_pixels(camera.size, name) for name, camera in cameras]
-    left_lens, right_lens = (lens_of(camera, name) for name, camera in cameras)
-    rectified = rectified and left_lens is right_lens is None
-    lenses = (left_lens, right_lens)
-    return Rig(Ks[0], Ks[1], E, sizes[0], sizes[1], distortion=lenses, rectified=rectified)
+    made_left, made_right = _made(left, "the left camera"), _made(right, "the right camera")
+    rectified = rectified and made_left.lens is made_right.lens is None
+    return Rig(made_left, made_right, E, rectified=rectified)
+
+
+def _made(camera: RawCamera, name: str) -> Camera:
+    """Check the values of a camera; errors use ``name``."""
+    K = check_intrinsics(array_of(camera.K, (3, 3), f"K of {name}"), f"K of {name}")
+    return Camera(K, _pixels(camera.size, name), lens_of(camera, name))
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> Rig:
-    """The rig of two rectified ``(3, 4)`` projections ``K [I | t]``, whose centres are ``-t``."""
+    """Return the rig of two rectified ``(3, 4)`` projections ``K [I | t]``, whose centres are ``-t``."""
     cameras, places = [], []
     for side, values, size in (("left", P_left, size_left), ("right", P_right, size_right)):
         P = array_of(values, (3, 4), f"the {side} projection")
-        cameras.append(Camera(check_intrinsics(P[:, :3], f"K of the {side} camera"), size))
+        cameras.append(RawCamera(check_intrinsics(P[:, :3], f"K of the {side} camera"), size))
         places.append(np.linalg.solve(P[:, :3], P[:, 3:]))
     E = np.vstack([np.hstack([np.eye(3), places[0] - places[1]]), (0, 0, 0, 1)])
     return make_rig(cameras[0], cameras[1], E, rectified=True)
 
 
 def in_units(rig: Rig, units: float) -> Rig:
-    """The rig in metres, of one in a unit of which a metre has ``units``."""
+    """Convert a rig in a unit with ``units`` per metre to metres."""
     E = rig.E.copy()
     E[:3, 3] /= units
     return replace(rig, E=E, as_taken=None if rig.as_taken is None else in_units(rig.as_taken, units))
 
 
-def rectified_from(rig: Rig, left: Camera, right: Camera, turns: tuple[Any, Any]) -> Rig:
-    """A rectified rig with the cameras that it was made from, by the rotations that rectified them."""
+def rectified_from(rig: Rig, left: RawCamera, right: RawCamera, turns: tuple[Any, Any]) -> Rig:
+    """Return a rectified rig with its original cameras, given the rectifying rotations."""
     R_left, R_right = (transform(R, (0, 0, 0), "the rectifying rotation") for R in turns)
     return replace(rig, as_taken=make_rig(left, right, np.linalg.inv(R_left) @ rig.E @ R_right))
 
@@ -350,14 +364,16 @@ def rig_from_parameters(
     cx_right: float | None = None,
     size: Size | None = None,
 ) -> Rig:
-    """A rectified rig from the numbers of a data sheet.
+    """Build a rectified rig from the numbers of a data sheet.
 
-    ``fx fy cx cy`` are in pixels of both images, the centre of the first pixel at 0; ``cx_right`` is the
-    right one's (``doffs``), which stands ``baseline_m`` metres to the right. ``size`` is (width, height).
-    Raises ``TypeError`` or ``ValueError`` for what is no finite number, or not above 0 where it must be.
+    ``fx fy cx cy`` are in pixels of both images, with the centre of the first pixel at 0; ``cx_right`` is the
+    right one's (``doffs``). The right camera is ``baseline_m`` metres to the right. ``size`` is (width,
+    height). Raises ``TypeError`` or ``ValueError`` for numbers that are not finite, or not positive where
+    required.
     """
-    for name, value, unit in (("fx", fx, "pixels"), ("fy", fy, "pixels"), ("baseline", baseline_m, "metres")):
-        check_positive(value, name, unit)
+    check_positive(fx, "fx", "pixels")
+    check_positive(fy, "fy", "pixels")
+    check_baseline_m(baseline_m, "baseline")
     columns = (cx, cx if cx_right is None else cx_right)
-    left, right = (Camera(intrinsics(fx, fy, x, cy), size) for x in columns)
+    left, right = (RawCamera(intrinsics(fx, fy, x, cy), size) for x in columns)
     return make_rig(left, right, baseline_m)

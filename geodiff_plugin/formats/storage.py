@@ -1,6 +1,7 @@
-"""Entries by name of YAML, JSON, TOML, OpenCV's FileStorage and archives of numpy arrays.
+"""Reads named entries of YAML, JSON, TOML, OpenCV's FileStorage and archives of numpy arrays.
 
-OpenCV's own reader is not used: a damaged file can corrupt its memory, and calibrations come from strangers.
+OpenCV's own reader is not used, because a damaged file can corrupt its memory, and calibrations are untrusted
+input.
 """
 
 from __future__ import annotations
@@ -18,50 +19,50 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.formats.files import parse_xml
 
 Entries = dict[str, Any]
-#: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
+#: Matches OpenCV's YAML header, which is invalid YAML; files written by hand copy it.
 OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
-#: A name and its value without a blank between them, which OpenCV reads, as in the settings of ORB-SLAM.
+#: Matches a name and value without a blank in between, which OpenCV accepts, as in ORB-SLAM's settings.
 TIGHT_ENTRY = re.compile(r"(?m)^(\s*[A-Za-z_][\w.]*:)(?=[^\s:])")
-#: A table, or a name and a list or a number, as TOML has them.
+#: Matches a TOML table, or a TOML name with a list, number or string.
 TOML_LINE = re.compile(
     r"(?m)^[ \t]*(?:\[+[\w.\"' -]+\]+|[\w.\"'-]+[ \t]*=[ \t]*[-+\d\[\"'tf].*)[ \t]*(?:#.*)?$"
 )
-#: Characters of a line that a message repeats.
-MOST_OF_LINE = 60
-#: Entries may lie so many levels below each other.
-MOST_LEVELS = 8
-#: Dumps of programs that share a list have a few.
-MOST_ALIASES = 32
-#: Numbers that an array of an .npz may have: those of cameras have 16 at most, lists of lenses 14.
-MOST_NUMBERS = 64
-#: Bytes before the numbers of an array in an .npz, at most.
+#: Maximum number of characters of a line that a message quotes.
+MAX_LINE_LENGTH = 60
+#: Maximum nesting of entries.
+MAX_LEVELS = 8
+#: Maximum number of aliases; dumps of programs that share a list have a few.
+MAX_ALIASES = 32
+#: Maximum number of values of an array in an .npz: camera arrays have at most 16, lens arrays 14.
+MAX_NUMBERS = 64
+#: Maximum number of bytes before the values of an array in an .npz.
 NPY_HEAD = 256
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML as OpenCV writes it: its matrices, since OpenCV 5 of one axis too, are mappings like others.
+    """YAML as written by OpenCV: its matrices (since OpenCV 5 also with one axis) are ordinary mappings.
 
-    An alias may stand for a part of the file without aliases: those of aliases grow a kilobyte to gigabytes.
+    An alias may only refer to a part without aliases: nested aliases can expand a kilobyte to gigabytes.
     """
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
-        self._aliases, self._holding = 0, set[int]()  # how many, and the nodes that hold any
+        self._aliases, self._holding = 0, set[int]()  # count of aliases, and nodes that contain any
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """The node, or that of an alias, which is refused where it holds others or is one of too many."""
+        """Compose a node; raise an error for aliases that contain others, or too many aliases."""
         is_alias, before = self.check_event(yaml.events.AliasEvent), self._aliases
         node = super().compose_node(parent, index)
         if is_alias:
             self._aliases += 1
-            # A node without an end stands for itself, inside of itself.
-            if self._aliases > MOST_ALIASES or id(node) in self._holding or node.end_mark is None:
-                expected = f"YAML with {MOST_ALIASES} aliases at most, none of which holds others"
-                bad_value("the file", expected, "more", "Write out what its aliases (*name) stand for.")
+            # A node without an end refers to itself.
+            if self._aliases > MAX_ALIASES or id(node) in self._holding or node.end_mark is None:
+                expected = f"YAML with at most {MAX_ALIASES} aliases, none of them nested"
+                bad_value("the file", expected, "more", "Replace the aliases (*name) by their content.")
         elif self._aliases > before:
             self._holding.add(id(node))
         return node
@@ -74,39 +75,39 @@ for _kind in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def read_yaml(text: str) -> Entries:
-    """The mapping that the first YAML document holds; later documents (``rostopic echo``) are left out."""
-    # Tabs separate words in files that OpenCV reads, and YAML has none.
+    """Read the mapping in the first YAML document; ignores later documents (``rostopic echo``)."""
+    # Files that OpenCV reads may separate words by tabs, which YAML forbids.
     text = TIGHT_ENTRY.sub(r"\1 ", OPENCV_HEAD.sub("", text).replace("\t", " "))
     try:
         content = next(yaml.load_all(text, _Loader), None)  # noqa: S506  (a safe one)
     except yaml.MarkedYAMLError as error:
         end, mark = error.problem_mark, error.context_mark or error.problem_mark
-        if mark is None or end is None or end.index >= len(text.rstrip()):  # it ends too early
+        if mark is None or end is None or end.index >= len(text.rstrip()):  # truncated
             raise
-        cure = "Correct the line; of another format give fx, fy, cx, cy and baseline, or K and E."
-        line = text.splitlines()[mark.line].strip()[:MOST_OF_LINE]
-        bad_value("the file", "YAML", f"{line!r} in line {mark.line + 1} ({error.problem})", cure)
+        hint = "Correct the line, or pass fx, fy, cx, cy and baseline, or K and E."
+        line = text.splitlines()[mark.line].strip()[:MAX_LINE_LENGTH]
+        bad_value("the file", "YAML", f"{line!r} in line {mark.line + 1} ({error.problem})", hint)
     if not isinstance(content, dict):
         bad_value("the file", "a YAML file of named entries", type(content).__name__)
     return content
 
 
 def read_content(text: str) -> Entries:
-    """The mapping that a text in XML, TOML, YAML or JSON holds."""
+    """Read the mapping in a text in XML, TOML, YAML or JSON."""
     if "<opencv_storage" in text:
         return _of_element(parse_xml(text))
     if text.lstrip()[:1] != "{" and TOML_LINE.search(text):
         with suppress(tomllib.TOMLDecodeError):
             return tomllib.loads(text)
-    # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know.
+    # JSON is YAML. Older versions of OpenCV write "1." and ".Nan" to it, which are invalid in JSON.
     return read_yaml(text)
 
 
 def read_storage(text: str) -> Entries:
-    """The entries of an OpenCV file by key in small letters: numbers as flat arrays, and strings."""
+    """Return the entries of an OpenCV file by key in lower case: flat number arrays, and strings."""
     content = read_content(text)
     entries: Entries = {}
-    unclear = set[str]()  # names that entries of several parts have, and none of them is the file's own
+    unclear = set[str]()  # names that occur in several sections, none of them top-level
     for key, value, level in _flat(content, ""):
         key, numbers = key.lower(), _numbers(without_sizes(value))
         value = value if numbers is None else numbers
@@ -122,22 +123,22 @@ def _is_matrix(value: Any) -> bool:
 
 
 def without_sizes(value: Any) -> Any:
-    """The ``data`` of a matrix that is written with its rows and columns; any other value as it is."""
+    """Return the ``data`` of a matrix written with rows and columns; other values unchanged."""
     return value["data"] if _is_matrix(value) else value
 
 
-#: What an outer name says of the camera: its side, or its number.
+#: Matches a camera's side or number in an outer name.
 SIDE = re.compile(
     r"left|right|(?<=cam)[012](?!\d)|(?<=cam_)[012](?!\d)|(?<=camera)[012](?!\d)|(?<=camera_)[012](?!\d)"
 )
 
 
 def _flat(content: Entries, outer: str, level: int = 0) -> Iterator[tuple[str, Any, int]]:
-    """Names, entries and levels, lower ones first, with the side of a camera where an outer name says one."""
+    """Yield names, entries and levels, inner ones first, with the camera's side if an outer name has one."""
     sides = set(SIDE.findall(outer.lower()))
     side = f"{sides.pop()}." if len(sides) == 1 else ""
     for key, value in content.items():
-        if isinstance(value, dict) and not _is_matrix(value) and level < MOST_LEVELS:
+        if isinstance(value, dict) and not _is_matrix(value) and level < MAX_LEVELS:
             yield from _flat(value, f"{outer}.{key}", level + 1)
     for key, value in content.items():
         yield f"{side}{key}", value, level
@@ -151,11 +152,11 @@ def _of_element(node: ElementTree.Element) -> Any:
 
 
 def _numbers(value: Any) -> np.ndarray | None:
-    """A number, or the numbers of a list or of lists in it, some of which may be text; else ``None``."""
+    """Return a number, or the numbers of (nested) lists, possibly as text; otherwise ``None``."""
     words = value if isinstance(value, list) else [value]
     while any(isinstance(word, list) for word in words):
         words = [part for word in words for part in (word if isinstance(word, list) else [word])]
-    try:  # OpenCV writes .Nan and .Inf, which Python reads without the dot
+    try:  # OpenCV writes .Nan and .Inf, which Python parses without the dot
         words = [re.sub(r"\.(nan|inf)", r"\1", w.lower()) if isinstance(w, str) else w for w in words]
         return None if any(isinstance(w, bool) for w in words) else np.array([float(w) for w in words])
     except (TypeError, ValueError, OverflowError):
@@ -163,22 +164,22 @@ def _numbers(value: Any) -> np.ndarray | None:
 
 
 def text_of_arrays(folder: Path) -> str:
-    """The small arrays of a folder of ``.npy`` as JSON, for ``read_opencv``; empty where there are none.
+    """Return the small arrays of a folder of ``.npy`` as JSON for ``read_named``; empty if there are none.
 
-    StereoVision and StereoPi's tutorial keep a calibration so: ``cam_mats_left.npy`` and so on.
+    StereoVision and StereoPi's tutorial store calibrations this way: ``cam_mats_left.npy`` etc.
     """
     matrices: Entries = {}
     for path in sorted(folder.glob("*.npy")):
-        if path.stat().st_size <= 8 * MOST_NUMBERS + NPY_HEAD:
-            with suppress(ValueError, OSError, EOFError):  # of objects, or damaged
+        if path.stat().st_size <= 8 * MAX_NUMBERS + NPY_HEAD:
+            with suppress(ValueError, OSError, EOFError):  # arrays of objects, or damaged files
                 value = np.load(path, allow_pickle=False)
-                if value.dtype.kind in "fiu" and value.size <= MOST_NUMBERS:
+                if value.dtype.kind in "fiu" and value.size <= MAX_NUMBERS:
                     matrices[path.stem] = value.tolist()
     return json.dumps(matrices) if len(matrices) > 1 else ""
 
 
 def _is_of_objects(archive: zipfile.ZipFile, name: str) -> bool:
-    """Whether an array of an ``.npz`` holds objects of Python, which only unpickling would read."""
+    """Whether an array of an ``.npz`` contains Python objects, which only unpickling would read."""
     with archive.open(name) as opened:
         return np.lib.format.read_magic(opened) == (1, 0) and bool(
             np.lib.format.read_array_header_1_0(opened)[2].hasobject
@@ -186,22 +187,22 @@ def _is_of_objects(archive: zipfile.ZipFile, name: str) -> bool:
 
 
 def text_of_npz(path: Path) -> str:
-    """The small arrays of an ``.npz`` as JSON, for ``read_opencv``; nothing is unpickled.
+    """Return the small arrays of an ``.npz`` as JSON for ``read_named``; never unpickles.
 
-    Lists of pictures' corners and the like, which are objects, are left out.
+    Skips object arrays, such as lists of corners per image.
     """
     matrices: Entries = {}
     try:
         with zipfile.ZipFile(path) as archive, np.load(path, allow_pickle=False) as arrays:
-            small = [each for each in archive.infolist() if each.file_size <= 8 * MOST_NUMBERS + NPY_HEAD]
+            small = [each for each in archive.infolist() if each.file_size <= 8 * MAX_NUMBERS + NPY_HEAD]
             names = [each.filename for each in small if not _is_of_objects(archive, each.filename)]
             for name in (each.removesuffix(".npy") for each in names):
                 value = arrays[name]
-                if value.dtype.kind in "fiu" and value.size <= MOST_NUMBERS:
+                if value.dtype.kind in "fiu" and value.size <= MAX_NUMBERS:
                     matrices[name] = value.tolist()
-    except Exception as error:  # of any kind that a damaged archive leads to
-        bad_value("calibration", "a whole .npz of matrices", f"{path} ({error})", "Is it cut off?")
+    except Exception as error:  # any error that a damaged archive may cause
+        bad_value("calibration", "a whole .npz of matrices", f"{path} ({error})", "It may be truncated.")
     if not matrices and len(names) < len(small):
-        got = f"{path} of pickled objects, which are never loaded"
+        got = f"{path} with pickled objects, which are never loaded"
         bad_value("calibration", "a .npz of matrices", got, "Save every matrix as an array (numpy.savez).")
     return json.dumps(matrices)

@@ -1,43 +1,46 @@
-"""The camera that depth is wanted in, ``--into``: a JSON file with K, E, width and height."""
+"""Reads the target camera of ``--reproject``: a JSON file with K, E, width and height."""
 
 from __future__ import annotations
 
 import json
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin._reprojection import PosedCamera
+from geodiff_plugin._internal.camera_checks import check_posed_camera
+from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin.cameras import PosedCamera
 from geodiff_plugin.formats.files import PathLike, read_text
 
 NEEDED = ("K", "E", "width", "height")
-#: The frame of that camera in ROS, where the file does not say it.
-FRAME_ID = "into"
+#: Default ROS frame of the target camera.
+FRAME_ID = "reprojected"
 _WHAT = 'a JSON file such as {"K": [[fx, 0, cx], ...], "E": [[...], ...], "width": 640, "height": 480}'
 
 
 def _read(path: PathLike) -> dict[str, object]:
-    name = "--into"
+    name = "--reproject"
     try:
-        said = json.loads(read_text(path, name, _WHAT))
+        entries = json.loads(read_text(path, name, _WHAT))
     except (ValueError, RecursionError) as error:
-        bad_value(name, _WHAT, f"{path}, which is no JSON ({type(error).__name__})")
-    missing = [key for key in NEEDED if not isinstance(said, dict) or key not in said]
+        bad_value(name, _WHAT, f"{path}, which is not JSON ({type(error).__name__})")
+    missing = [key for key in NEEDED if not isinstance(entries, dict) or key not in entries]
     if missing:
         bad_value(name, _WHAT, f"{path} without {', '.join(missing)}")
-    return said
+    return entries
 
 
 def read_target_camera(path: PathLike) -> PosedCamera:
-    """``K (3, 3)`` pixels, ``E (4, 4)`` pose in the left camera's frame, ``width`` and ``height`` of a file.
+    """Read ``K (3, 3)`` pixels, ``E (4, 4)`` pose in the left camera's frame, ``width`` and ``height``.
 
-    E is camera-to-world with the left camera as the world, OpenCV's axes, metres, as everywhere here.
+    E is camera-to-world with the left camera as world, OpenCV's axes, metres, as in the whole package.
 
     Raises:
-        InputError: a file that is no such JSON, or whose camera is none.
+        InputError: not such a JSON file, or an invalid camera.
     """
-    said = _read(path)
-    return PosedCamera.checked(said["K"], said["E"], (said["width"], said["height"]), "--into")
+    entries = _read(path)
+    return check_posed_camera(
+        entries["K"], entries["E"], (entries["width"], entries["height"]), "--reproject"
+    )
 
 
 def frame_of_target(path: PathLike) -> str:
-    """``frame_id`` of such a file: the name of the camera's frame in ROS."""
+    """Return ``frame_id`` of the file: the ROS frame of the camera."""
     return str(_read(path).get("frame_id", FRAME_ID))

@@ -1,4 +1,4 @@
-"""Depth of every pair of a bag, as a bag (``geodiff depth LEFT.mcap``)."""
+"""Writes the depth of every pair of a bag to a bag (``geodiff depth LEFT.mcap``)."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats import recordings
-from geodiff_plugin.formats.out import check_new_file, write_text
-from geodiff_plugin.formats.target import frame_of_target, read_target_camera
+from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin.formats import check_new_file, frame_of_target, read_target_camera, recordings, write_text
+from geodiff_plugin.jobs.camera_sources import given_camera_options
 from geodiff_plugin.jobs.finished import Row
 from geodiff_plugin.jobs.many import depth_pairs
-from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions
+from geodiff_plugin.jobs.notices import Notify, silent
+from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import start_many
-from geodiff_plugin.jobs.report import read_report
-from geodiff_plugin.jobs.telling import Tell, silent
-from geodiff_plugin.jobs.writing import INTO
+from geodiff_plugin.jobs.report import known_sigma, read_report, valid_depth
+from geodiff_plugin.jobs.writing import REPROJECTED_FILES
 
 
 @dataclass(frozen=True)
 class BagResult:
-    """The bag that was written, how many depth images it holds, and the row of every pair.
+    """Result of a bag: the written bag, its number of depth images, and the row of every pair.
 
     ``frames`` is the folder with the results of the pairs.
     """
@@ -34,60 +33,54 @@ class BagResult:
     rows: list[Row]
 
 
-def depth_bag(options: DepthOptions, *, tell: Tell = silent, progress: bool = False) -> BagResult:
-    """What ``geodiff depth`` does with a bag: its pairs into the folder ``NAME-frames``, then one bag.
+def depth_bag(options: DepthOptions, *, notify: Notify = silent, progress: bool = False) -> BagResult:
+    """Implement ``geodiff depth`` for a bag: write its pairs to the folder ``NAME-frames``, then one bag.
 
     Args:
-        options: of the command; ``out`` is the bag to be written, ``depth.mcap`` by default. Its images
-            are of the camera ``into``, if one is given.
-        tell: takes the lines for the user.
-        progress: whether a bar on stderr counts the pairs.
+        options: options of the command; ``out`` is the bag to write, ``depth.mcap`` by default. Its images
+            are in the camera ``reproject``, if given.
+        notify: receives messages for the user.
+        progress: whether to count the pairs with a progress bar on stderr.
     """
     out, topics = options.out or Path("depth.mcap"), options.bag_topics()
     if out.suffix not in recordings.BAG_SUFFIXES or out.is_dir():
-        expected = f"a file that ends in {' or '.join(recordings.BAG_SUFFIXES)}, as LEFT is a bag"
+        expected = f"a file name ending in {' or '.join(recordings.BAG_SUFFIXES)}, because LEFT is a bag"
         bad_value("--out", expected, out)
-    options.refuse(["shard", "engine"], "{} cannot be used with a bag, which is written as one.")
+    options.raise_input_error(
+        ["shard", "engine"], "{} cannot be used with a bag, which is written by one process."
+    )
     check_new_file(out, options.overwrite)
     pairs = recordings.list_pairs(options.left, topics, options.tolerance)
     frames = out.with_name(f"{out.stem}-frames")
     options, frame_id = _with_its_cameras(replace(options, out=frames), frames)
-    refs = start_many(options, tell)
-    rows = depth_pairs(options, refs, tell=tell, progress=progress)
+    refs = start_many(options, notify)
+    rows = depth_pairs(options, refs, notify=notify, progress=progress)
 
-    camera = None if options.into is None else read_target_camera(options.into)
+    camera = None if options.reproject is None else read_target_camera(options.reproject)
 
     def results() -> Iterator[recordings.BagFrame]:
         for ref, (stamp, _) in zip(refs, pairs, strict=True):
             if report := read_report(frames / ref.name):
                 folder = frames / ref.name
                 K = report["K"] if camera is None else camera.K
-                depth_m = _valid_depth(folder) if camera is None else _loaded(folder / INTO[0])
-                yield recordings.BagFrame(stamp, depth_m, np.reshape(K, (3, 3)))
+                depth_m = valid_depth(folder) if camera is None else np.load(folder / REPROJECTED_FILES[0])
+                sigma_m = None if camera is not None else known_sigma(folder)
+                yield recordings.BagFrame(stamp, depth_m, np.reshape(K, (3, 3)), sigma_m)
 
-    frame_id = frame_id if options.into is None else frame_of_target(options.into)
+    frame_id = frame_id if options.reproject is None else frame_of_target(options.reproject)
     count = recordings.write_depth_bag(out, results(), frame_id, options.encoding)
     return BagResult(out, frames, count, rows)
 
 
-def _loaded(path: Path) -> np.ndarray:
-    values: np.ndarray = np.load(path, allow_pickle=False)
-    return values
-
-
-def _valid_depth(folder: Path) -> np.ndarray:
-    """The depth of a result's folder, ``(H, W)`` metres, 0 where its confidence is 0: there is none."""
-    depth_m, confidence = _loaded(folder / "depth.npy"), folder / "confidence.npy"
-    return depth_m * (_loaded(confidence) > 0) if confidence.is_file() else depth_m
-
-
 def _with_its_cameras(options: DepthOptions, folder: Path) -> tuple[DepthOptions, str]:
-    """The calibration of a bag in files of a folder unless cameras are given, and its frame's name."""
-    if options.calib or any(getattr(options, name) is not None for name in (*PARAMETERS, "k", "e")):
+    """Write the calibration of a bag to a folder unless cameras are given; also return its frame name."""
+    if given_camera_options(options):
         return options, "left"
     texts, frame_id = recordings.stereo_calibration(options.left, options.bag_topics())
     files = tuple(folder / f"camera_info_{number}.yaml" for number in range(len(texts)))
     for file, text in zip(files, texts, strict=True):
-        if not file.is_file() or file.read_text(encoding="utf-8") != text:  # else results were made by it
+        if (
+            not file.is_file() or file.read_text(encoding="utf-8") != text
+        ):  # rewriting it would invalidate finished results
             write_text(file, text)
     return replace(options, calib=files), frame_id

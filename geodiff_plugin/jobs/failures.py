@@ -1,4 +1,4 @@
-"""Failures of the items of a job, each cause told once."""
+"""Reports failures of the items of a job, each cause once."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import errno
 import traceback
 from collections.abc import Callable
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.formats.out import reason_of
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.findings import some_names
+from geodiff_plugin.formats import reason_of
 from geodiff_plugin.jobs.journal import Item
 
-#: Items of one cause that are named.
-MOST_NAMES = 5
-#: With one of these causes the next item cannot be written either.
+#: Error numbers after which no further item can be written.
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-#: What is said of a run that ended early.
-RESUMES = "Finished pairs stay; the same command goes on with the rest."
+#: Appended to the message of a run that ended early.
+RESUMES = "Finished pairs are kept; run the same command again to resume."
 
 
 class DiskFull(InputError):
@@ -23,7 +22,7 @@ class DiskFull(InputError):
 
 
 def full_disk(error: BaseException) -> DiskFull | None:
-    """What to say where an error comes from a full disk, which ends a whole run; ``None`` for all others."""
+    """Return an error for the user if the cause is a full disk, which ends the run; otherwise ``None``."""
     if isinstance(error, DiskFull):
         return error
     cause: BaseException | None = error
@@ -35,51 +34,52 @@ def full_disk(error: BaseException) -> DiskFull | None:
 
 
 class Failures:
-    """What made items fail: the first of a cause is told at once, unless all items fail as the first did.
+    """Reports the first failure of each cause at once, unless all items so far failed for the same reason.
 
-    ``total`` is how many items there are, ``noun`` what one is, and ``tell`` takes the lines.
+    ``total`` is the number of items, ``noun`` the name of an item, and ``notify`` receives the messages.
     """
 
-    def __init__(self, total: int, noun: str, tell: Callable[[str], None]) -> None:
-        self._total, self._noun, self._tell = total, noun, tell
-        self._struck: dict[str, list[str]] = {}  # labels of the items that failed, by the cause
-        self._unsaid: list[str] = []  # the first failure, as long as every item fails as the first one did
+    def __init__(self, total: int, noun: str, notify: Callable[[str], None]) -> None:
+        self._total, self._noun, self._notify = total, noun, notify
+        self._labels: dict[str, list[str]] = {}  # labels of the failed items by cause
+        self._pending: list[
+            str
+        ] = []  # the first failure, while every item so far has failed for the same reason
         self._any_passed = False
 
     def passed(self) -> None:
-        """Note that an item did not fail."""
+        """Record that an item did not fail."""
         self._any_passed = True
         self._say()
 
     def add(self, item: Item, error: Exception) -> str:
-        """Note a failure, to be told unless its cause has been; the message."""
+        """Record a failure, report it if its cause is new, and return the message."""
         is_plain = isinstance(error, (InputError, OSError, ValueError))
         message = str(error) if is_plain else f"{type(error).__name__}: {error}"
         cause = message
         for word in sorted(item.words or (item.label,), key=len, reverse=True):
             cause = cause.replace(word, "")
-        if cause not in self._struck:
-            self._unsaid.append(f"{item.label}: {message}")
-            if not is_plain:  # a defect of ours
-                self._tell("".join(traceback.format_exception(error)).rstrip())
-        self._struck.setdefault(cause, []).append(item.label)
-        if self._any_passed or len(self._struck) > 1:
+        if cause not in self._labels:
+            self._pending.append(f"{item.label}: {message}")
+            if not is_plain:  # an internal error
+                self._notify("".join(traceback.format_exception(error)).rstrip())
+        self._labels.setdefault(cause, []).append(item.label)
+        if self._any_passed or len(self._labels) > 1:
             self._say()
         return message
 
     def _say(self) -> None:
-        for message in self._unsaid:
-            self._tell(f"geodiff: {message}")
-        self._unsaid.clear()
+        for message in self._pending:
+            self._notify(f"geodiff: {message}")
+        self._pending.clear()
 
     def report(self) -> None:
-        """Tell which items each cause struck, where several; raise if it was one, and all items."""
-        if self._unsaid and sum(map(len, self._struck.values())) == self._total > 1:
-            everywhere = f"The same holds for all {self._total} {self._noun}s; nothing was computed."
-            raise InputError(f"{self._unsaid[0]} {everywhere}")
+        """Report which items each cause affected, if several; raise if one cause affected all items."""
+        if self._pending and sum(map(len, self._labels.values())) == self._total > 1:
+            everywhere = f"All {self._total} {self._noun}s failed for this reason; nothing was computed."
+            raise InputError(f"{self._pending[0]} {everywhere}")
         self._say()
-        for labels in self._struck.values():
+        for labels in self._labels.values():
             if len(labels) > 1:
-                names = ", ".join(labels[:MOST_NAMES]) + (", ..." if len(labels) > MOST_NAMES else "")
                 count = f"{len(labels)} of {self._total} {self._noun}s"
-                self._tell(f"geodiff: {count} failed for one reason: {names}.")
+                self._notify(f"geodiff: {count} failed for the same reason: {some_names(labels)}.")

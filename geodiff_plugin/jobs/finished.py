@@ -1,52 +1,60 @@
-"""Pairs that an earlier run has finished, by their reports."""
+"""Recognises pairs finished by an earlier run, by their reports."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.config import Affects, affected
-from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.jobs.changes import input_change, option_changes
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.pairs import file_digests
 from geodiff_plugin.jobs.report import read_report
-from geodiff_plugin.options import flag_of
+from geodiff_plugin.settings import Affects, settings_of
 
 Row = dict[str, Any]
 
 
-def file_digests(options: DepthOptions) -> dict[str, str]:
-    """SHA-256 by path of the readable files that a pair is made from."""
-    digests = {}
-    for path in options.read_files():
-        with suppress(OSError):  # its reader says why
-            digests[str(path)] = file_digest(path)
-    return digests
+def option_changes(made: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """List the options, by flag, whose values differ in ``made``; ``None`` is an omitted option."""
+    changes = []
+    for flag, value in wanted.items():
+        was = made.get(flag)
+        if was != value:
+            typed = f"the default of {flag}" if was is None else f"{flag} {was}"
+            changes.append(f"made with {typed} instead of {'the default' if value is None else value}")
+    return changes
+
+
+def input_change(name: str) -> str:
+    """Return the message about an input whose content has changed."""
+    return f"made before {name} changed"
 
 
 def changed_options(options: DepthOptions, made: Mapping[str, Any]) -> list[str]:
-    """In words, how the options that a result was made with differ from these, where that changes it.
+    """Describe how the options of a result differ from these, among options that affect it.
 
-    Of an option that ``made`` does not know, as it is a newer one, nothing is said.
+    Skips options that ``made`` lacks because it is from an older version.
     """
-    wanted, of_fields = options.as_json(), DepthOptions.__dataclass_fields__
-    names = [name for name in wanted if name in made and affected(of_fields[name]) is not Affects.NOTHING]
-    before, now = ({flag_of(of_fields[name]): values[name] for name in names} for values in (made, wanted))
+    wanted = options.as_json()
+    compared = [
+        (name, option.flag)
+        for name, option in settings_of(DepthOptions).items()
+        if name in made and option.affects is not Affects.NOTHING
+    ]
+    before, now = ({flag: values[name] for name, flag in compared} for values in (made, wanted))
     return option_changes(before, now)
 
 
 def finished_row(options: DepthOptions) -> Row | None:
-    """The row of a pair that an earlier run has finished; ``None`` where it is still to be done.
+    """Return the row of a pair finished by an earlier run; ``None`` if it still has to be processed.
 
-    A result of other options, or of files whose content has changed since, is an error.
+    Raises an error if the result is of other options, or of files whose content has changed.
     """
     assert options.out is not None
     report = read_report(options.out)
     try:
         made, row = report["arguments"], row_of(report)
-        # The report is written last and names every file, so a folder that holds all of them is whole.
+        # The report is written last and lists all files, so a folder that has all of them is complete.
         if not all((options.out / name).stat().st_size > 0 for name in report["files"]["names"]):
             return None
     except (OSError, KeyError, TypeError):
@@ -56,23 +64,36 @@ def finished_row(options: DepthOptions) -> Row | None:
     changed = [path for path, digest in file_digests(options).items() if digests.get(path, digest) != digest]
     changes += map(input_change, changed)
     if changes:
-        cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
+        hint = (
+            "Choose another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
+        )
         got = f"{options.out}, {', '.join(changes)}"
-        bad_value("--out", "a folder of results of the same options and files", got, cure)
+        bad_value("--out", "a folder with results of the same options and files", got, hint)
     return row
 
 
+def _confidence(verdict: dict[str, Any]) -> float | None:
+    """Return the mean confidence of a verdict in a report."""
+    found: dict[str, float | None] = verdict["facts"].get("matched_fraction", {})
+    return found.get("confidence")
+
+
+def _texts(report: dict[str, Any], *severities: str) -> list[str]:
+    """Return the messages of a report's findings with one of these severities."""
+    return [each["text"] for each in report.get("findings", ()) if each["severity"] in severities]
+
+
 def row_of(report: dict[str, Any]) -> Row:
-    """What the table says of a pair, and why it is not to be trusted."""
+    """Return the table row of a report, including why the pair is not trusted."""
     depth, verdict = report["depth"], report["verdict"]
     return {
         "near_m": depth["min_m"],
         "median_m": depth["median_m"],
         "far_m": depth["max_m"],
         "verdict": verdict["status"],
-        "confidence": verdict["indicators"]["confidence"] if verdict["status"] == "trusted" else None,
+        "confidence": _confidence(verdict) if verdict["status"] == "trusted" else None,
         "seconds": round(sum(report["seconds"].values()), 3),
-        "message": " ".join(report["warnings"]) or None,
+        "message": " ".join(_texts(report, "warning", "remark")) or None,
         "reasons": " ".join(verdict["reasons"]),
-        "codes": " ".join(message["code"] for message in report.get("messages", ())) or None,
+        "codes": " ".join(message["code"] for message in report.get("findings", ())) or None,
     }

@@ -1,57 +1,53 @@
-"""Many pairs: one prior, four stages side by side, a folder and a table row a pair."""
+"""Processes many pairs: one prior, four concurrent stages, and a folder and a table row for each pair."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import torch
 
-from geodiff_plugin._checks import InputError, refuse
-from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import BackgroundTask, WithinCores, available_cores, leaves_cpu_free
-from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.evidence.inputs import left_images
-from geodiff_plugin.evidence.store import EvidenceStore
-from geodiff_plugin.formats.out import OutFolder
-from geodiff_plugin.formats.reading import has_pose_per_image
+from geodiff_plugin._internal.checks import InputError, raise_input_error
+from geodiff_plugin._internal.threads import WithinCores, available_cores, leaves_cpu_free
+from geodiff_plugin.findings import Severity
+from geodiff_plugin.formats import OutFolder, has_pose_per_image
 from geodiff_plugin.jobs.failures import RESUMES, full_disk
-from geodiff_plugin.jobs.finished import Row, file_digests, finished_row
+from geodiff_plugin.jobs.finished import Row, finished_row
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard
+from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import DepthOptions, start_pair
-from geodiff_plugin.jobs.pair import run_pair
+from geodiff_plugin.jobs.pair import run_read_pair
 from geodiff_plugin.jobs.pairs import COLUMNS, SUMMARY, PairRef, options_of
 from geodiff_plugin.jobs.prior import graphs_for_many, prior_of_options
-from geodiff_plugin.jobs.reading import PairInputs, read_pair
-from geodiff_plugin.jobs.records import JobLog, PairRun
-from geodiff_plugin.jobs.runner import Runner, SideBySide, Stage
-from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcesses
-from geodiff_plugin.jobs.steady import write_steady_frames
+from geodiff_plugin.jobs.processes import ProcessEnded, WorkerProcesses, can_have_workers
+from geodiff_plugin.jobs.reading import PairReader
+from geodiff_plugin.jobs.records import PairRun, ReadPair
+from geodiff_plugin.jobs.runner import ParallelStage, Runner, Stage, on_ray
+from geodiff_plugin.jobs.smoothing import write_smoothed_frames
 from geodiff_plugin.jobs.tables import write_table
-from geodiff_plugin.jobs.telling import Tell, silent
-from geodiff_plugin.jobs.views import Views
 from geodiff_plugin.jobs.writing import write_row
-from geodiff_plugin.options import on_ray
 from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.runtime.prefetch import prefetch_evidence
 
-#: What became of every pair.
+#: Name of the journal with the outcome of every pair.
 JOURNAL = ".pairs.jsonl"
-#: Processes that write, at most: to write a pair takes up to twice as long as to guide it on a GPU, and one
-#: more makes up for pairs that take longer. Each has Python, torch and a pair in memory.
-MOST_WRITERS = 3
-#: Cores that they leave to the threads that read, make evidence and guide.
-CORES_OF_STAGES = 3
+#: Maximum number of writer processes. Writing a pair takes up to twice as long as guiding it on a GPU; a
+#: third process covers slower pairs. Each process holds Python, torch and a pair in memory.
+MAX_WRITERS = 3
+#: Cores reserved for the threads that read, prepare evidence and guide.
+RESERVED_CORES = 3
 
 
 class _EndsRun(BaseException):
-    """Ends the whole run: no prior, a full disk, or no process that writes; its cause says which."""
+    """Ends the whole run: no prior, a full disk, or no writer process. Its cause states which."""
 
 
 @contextmanager
-def _ends_run_if_all_would_fail() -> Iterator[None]:
+def _ends_run_on_fatal_error() -> Iterator[None]:
     try:
         yield
     except ProcessEnded as error:
@@ -63,25 +59,27 @@ def _ends_run_if_all_would_fail() -> Iterator[None]:
 
 
 @dataclass(eq=False)
-class _OnItsWay:
-    """A pair between two stages; ``entries`` of its report are those that only a run over many knows."""
+class _PairState:
+    """State of a pair between two stages: its held folder, the inputs, and the run after the guided call."""
 
-    options: DepthOptions
     folder: OutFolder
-    log: JobLog
-    entries: dict[str, Any]
-    inputs: PairInputs
+    pair: ReadPair
     run: PairRun | None = None
 
 
 class Stages:
-    """The stages of a pair, each called in a thread of its own.
+    """Implements the stages of a pair, each called in its own thread.
 
-    A ``pipe`` that is not given is loaded when the first pair has been read; ``among`` stages compute at the
-    same time and share the cores; ``tell`` hears which prior it is, and what was assumed. Beside a GPU the
-    pairs are written by ``writers`` separate processes: a thread that writes would keep the threads that
-    launch kernels from Python's lock. They start at once, while the prior is loaded. If ``writers`` is 0, as
-    on a CPU, a thread writes.
+    Next to a GPU, worker processes write the pairs. They start at once, while the prior loads. A writer
+    thread would take the GIL from the threads that launch kernels.
+
+    Args:
+        options: options of the run.
+        device: device of the prior.
+        pipe: a guided pipeline; by default the prior of the options is loaded after the first pair was read.
+        among: number of stages that compute at the same time and share the cores.
+        notify: receives messages about the prior and about assumptions.
+        writers: number of writer processes; 0 writes in a thread, as on a CPU.
     """
 
     def __init__(
@@ -91,195 +89,200 @@ class Stages:
         pipe: Any = None,
         *,
         among: int = 2,
-        tell: Tell = silent,
+        notify: Notify = silent,
         writers: int = 0,
     ) -> None:
         self._options, self._device, self._pipe = options, device, pipe
-        self._among, self._tell = among, tell
-        self._views, self._folders = Views(options), dict[str, ExitStack]()
-        self._writers = SeparateProcesses(write_row.__module__, writers) if writers else None
-        #: The stages in their order.
+        self._among, self._notify = among, notify
+        self._reader, self._folders = PairReader(options), dict[str, ExitStack]()
+        self._writers = WorkerProcesses(write_row.__module__, writers) if writers else None
+        #: The stages in order.
         self.all: tuple[Stage, ...] = (
             self.read,
             self.evidence,
             self.guide,
-            SideBySide(self.write, max(1, writers)),
+            ParallelStage(self.write, max(1, writers)),
         )
 
     def close(self) -> None:
-        """Close the videos and end the processes that write, when the threads are done."""
-        self._views.close()
+        """Close the videos, and end the writer processes after the threads have finished."""
+        self._reader.close()
         if self._writers is not None:
             self._writers.close()
 
-    def read(self, item: Item) -> _OnItsWay:
-        """Look at the files, take the folder, decode the views."""
+    def read(self, item: Item) -> _PairState:
+        """Check the files, hold the output folder, and decode the views."""
         ref: PairRef = item.payload
         options = options_of(ref, self._options)
-        folder = start_pair(options, photographs=ref.frame is None)
+        folder = start_pair(options, images=ref.frame is None)
         held = self._folders[item.key] = ExitStack()
-        with _ends_run_if_all_would_fail():
+        with _ends_run_on_fatal_error():
             held.enter_context(folder)
-        digests = file_digests(options)  # before: what changes later is another version
-        entries = {"pair": {"name": ref.name, "frame": ref.frame, "sha256": digests}}
-        log = JobLog()
-        with log.stage("calibration"):
-            inputs = read_pair(options, self._views.of(ref))
-        for note in inputs.notes:
-            self._tell(note)
-        return _OnItsWay(options, folder, log, entries, inputs)
+        pair = self._reader.read(ref, options)
+        for finding in pair.inputs.guidance.findings:
+            if finding.severity is Severity.ASSUMPTION:
+                self._notify(finding)
+        return _PairState(folder, pair)
 
-    def evidence(self, pair: _OnItsWay) -> _OnItsWay:
-        """What the views say by themselves, into a store of the pair's own, where the call finds it."""
-        if self._pipe is None:
-            try:
-                tell = None if self._tell is silent else self._tell
-                graphs = graphs_for_many(self._options, self._device)
-                self._pipe = prior_of_options(replace(self._options, graphs=graphs), self._device, tell)
-            except Exception as error:
-                raise _EndsRun from error
-        device, guidance, left = self._device_of_pipe, pair.inputs.guidance, pair.inputs.left
-        plain, kernels = torch.autocast(device.type, enabled=False), without_kernels(self._options.no_kernels)
-        with pair.log.stage("evidence"), WithinCores(self._among), torch.no_grad(), plain, kernels:
-            guidance.evidence_store = EvidenceStore(1, copies=False)
-            # Threads share a stream by default, and the network of the pair before still runs on it. The
-            # evidence has a stream of its own, which does not wait for that network.
-            work = functools.partial(_prepare, guidance, left, device)
-            BackgroundTask(work, device, own_stream=True, follows=False).result()
-        return pair
+    def evidence(self, state: _PairState) -> _PairState:
+        """Compute the evidence of the views into the pair's own store, which the guided call reads."""
+        self._load_prior()
+        device, inputs = self._device_of_pipe, state.pair.inputs
+        sharing: Any = {"among": self._among, "kernels": not self._options.no_triton}
+        with state.pair.log.stage("evidence"):
+            prefetch_evidence(inputs.guidance, inputs.left, device, **sharing)
+        return state
 
-    @functools.cached_property
+    def _load_prior(self) -> None:
+        """Load the prior if it is not loaded; no pair can be guided without it."""
+        if self._pipe is not None:
+            return
+        try:
+            notify = None if self._notify is silent else self._notify
+            graphs = graphs_for_many(self._options, self._device)
+            self._pipe = prior_of_options(replace(self._options, cuda_graphs=graphs), self._device, notify)
+        except Exception as error:
+            raise _EndsRun from error
+
+    @cached_property
     def _device_of_pipe(self) -> torch.device:
-        """Found once, as the pipeline looks through all of its layers for it."""
+        """Return the pipeline's device, cached because the pipeline searches all of its layers for it."""
         device: torch.device = self._pipe._execution_device
         return device
 
-    def guide(self, pair: _OnItsWay) -> _OnItsWay:
-        """The guided call."""
+    def guide(self, state: _PairState) -> _PairState:
+        """Make the guided call."""
         with WithinCores(self._among):
-            pair.run = run_pair(self._pipe, pair.options, pair.inputs, pair.log)
-        pair.inputs.guidance.evidence_store = None
-        return pair
+            state.run = run_read_pair(self._pipe, state.pair)
+        state.pair.inputs.guidance.evidence_store = None
+        return state
 
-    def write(self, pair: _OnItsWay) -> Row:
-        """The files, the report last, and the row of the table."""
-        assert pair.run is not None
-        with _ends_run_if_all_would_fail():
+    def write(self, state: _PairState) -> Row:
+        """Write the files, the report last, and return the table row."""
+        assert state.run is not None
+        with _ends_run_on_fatal_error():
             if self._writers is None:
-                return write_row(pair.folder, pair.run, pair.entries)
-            return self._writers.call(write_row, pair.folder.place, pair.run, pair.entries)
+                return write_row(state.folder, state.run)
+            return self._writers.call(write_row, state.folder.place, state.run)
 
     def release(self, item: Item) -> None:
-        """Give back the folder of a pair."""
+        """Release the folder of a pair."""
         self._folders.pop(item.key, ExitStack()).close()
 
 
 def count_writers(device: torch.device, pairs: int, processes: int) -> int:
-    """How many processes write so many pairs; none where the stages before need all cores.
+    """Return the number of writer processes for this number of pairs; 0 if the other stages need all cores.
 
-    ``processes`` like this one share the cores of the machine.
+    ``processes`` is the number of processes like this one that share the machine's cores.
     """
-    if not leaves_cpu_free(device):
+    if not (leaves_cpu_free(device) and can_have_workers()):
         return 0
-    return min(pairs, MOST_WRITERS, max(1, available_cores() // processes - CORES_OF_STAGES))
+    return min(pairs, MAX_WRITERS, max(1, available_cores() // processes - RESERVED_CORES))
 
 
-def _prepare(guidance: GeometryGuidance, left: Any, device: torch.device) -> None:
-    """Work the evidence of a left image out on a device; the guidance keeps it in its store."""
-    guidance.prepare(left_images(left).to(device))
-
-
-def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
-    """Refuse one baseline for all pairs of a model, because its pairs have different ones."""
+def _raise_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
+    """Reject one baseline for all pairs of a model, because its pairs have different baselines."""
     given = [] if options.baseline is None or len(refs) < 2 else [options_of(ref, options) for ref in refs]
     for calib in dict.fromkeys(each.calib for each in given if each.calib):
         if has_pose_per_image(calib if len(calib) > 1 else calib[0]):
-            each = f"every pair of {calib[0]} has a baseline of its own"
-            refuse(f"--baseline cannot be used here: {each}. Try geodiff capture MODEL --known-length.")
+            each = f"every pair of {calib[0]} has its own baseline"
+            raise_input_error(f"--baseline cannot be used: {each}. Use geodiff capture MODEL --known-length.")
 
 
 def depth_pairs(
     options: DepthOptions,
     refs: Sequence[PairRef],
     *,
-    tell: Tell = silent,
+    notify: Notify = silent,
     progress: bool = False,
     pipe: Any = None,
 ) -> list[Row]:
-    """What ``geodiff depth`` does with many pairs: a folder each below ``options.out``, and ``pairs.csv``.
+    """Implement ``geodiff depth`` for many pairs: a folder each in ``options.out``, and ``pairs.csv``.
 
-    Finished pairs of an earlier run are kept; a pair that fails is a row, and the others go on. A shard
-    (``options.shard``) works on its part alone, and has a table of its own, ``pairs.I-of-N.csv``.
+    Keeps finished pairs of an earlier run. A failed pair becomes a row, and the run continues. A shard
+    (``options.shard``) processes its part only, and writes its own table, ``pairs.I-of-N.csv``.
 
     Args:
-        options: of the command, with ``out``.
-        refs: of ``start_many`` with the same options.
-        tell: takes the lines for the user.
-        progress: whether a bar on stderr counts the pairs.
-        pipe: a guided pipeline, in place of the prior that the options name.
+        options: options of the command, with ``out``.
+        refs: pairs from ``start_many`` with the same options.
+        notify: receives messages for the user.
+        progress: whether to count the pairs with a progress bar on stderr.
+        pipe: a guided pipeline, used in place of the prior of the options.
 
     Returns:
-        A row a pair, in order, with ``COLUMNS``; ``result`` is ``"done"``, ``"there"`` or ``"failed"``.
+        One row per pair, in order, with ``COLUMNS``; ``result`` is ``"done"``, ``"kept"`` or ``"failed"``.
 
     Raises:
-        InputError: all pairs fail for one reason; results of other options; a full disk.
+        InputError: all pairs fail for one reason, the folder has results of other options, or the disk is
+            full.
     """
     assert options.out is not None
-    _refuse_one_length(options, refs)
+    _raise_one_length(options, refs)
     shard = Shard.of(options.shard)
     device = _device_of(options, shard)
-    options.config()  # refuses options that contradict each other before anything is written
-    if options.steady and not shard.whole:
-        refuse("--steady needs all frames: run the shards without it, then the whole with it.")
-    refs = shard.part(refs)
+    options.config()  # raises if options contradict each other, before anything is written
+    if options.temporal_smoothing and not shard.whole:
+        raise_input_error(
+            "--temporal-smoothing needs all frames. Run the shards without it, then the whole job with it."
+        )
     with Journal(options.out / JOURNAL, shard) as journal:
-        items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
-        there = _rows_there(items, options, journal)
-        with _nothing_left_if_all_fail(journal):
+        items = [_item(ref, options.out) for ref in shard.part(refs)]
+        finished = _finished_rows(items, options, journal)
+        with _cleaned_up_on_error(journal):
+            runner = Runner(items, journal, noun="pair", is_recoverable=(Exception,), progress=progress)
             if options.engine == "ray":
-                pairs_to_folders = on_ray("pairs_to_folders")
-                records = pairs_to_folders(options, items, journal, progress=progress)
+                records = runner.run_elsewhere(partial(on_ray("pairs_to_folders"), options))
             else:
-                left = sum(journal.get(item) is None for item in items)
-                writers = count_writers(device, left, shard.processes_here(torch.cuda.device_count()))
-                runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
-                records = _through(Stages(options, device, pipe, tell=tell, writers=writers), runner)
-        rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
-        write_table(shard.path(options.out / SUMMARY), rows, tell)
-        if options.steady:
-            failed = {row["pair"] for row in rows if row["result"] == "failed"}
-            with closing(Views(options)) as views:
-                whole = [ref for ref in refs if ref.name not in failed]
-                write_steady_frames(options, whole, views.of, tell)
+                processes = shard.processes_here(torch.cuda.device_count())
+                writers = count_writers(device, len(runner.left), processes)
+                records = _through(Stages(options, device, pipe, notify=notify, writers=writers), runner)
+        rows = [_final(record, finished.get(record["key"]), options, notify) for record in records]
+        write_table(shard.path(options.out / SUMMARY), rows, notify)
+        if options.temporal_smoothing:
+            _average_frames(options, items, rows, notify)
     return rows
 
 
+def _item(ref: PairRef, out: Path) -> Item:
+    return Item(ref.name, ref, words=(str(ref.left), str(ref.right), str(out / ref.name)))
+
+
+def _average_frames(
+    options: DepthOptions, items: Sequence[Item], rows: Sequence[Row], notify: Notify
+) -> None:
+    """Apply ``--temporal-smoothing`` to the frames that did not fail."""
+    failed = {row["pair"] for row in rows if row["result"] == "failed"}
+    with PairReader(options) as reader:
+        refs = [item.payload for item in items if item.key not in failed]
+        write_smoothed_frames(options, refs, reader.frames_of, notify)
+
+
 def _device_of(options: DepthOptions, shard: Shard) -> torch.device:
-    """The device that the options name; of several GPUs that of the shard."""
+    """Return the device of the options; if there are several GPUs, the shard's."""
     device = pick_device(options.device)
     if device.type == "cuda" and device.index is None:
         return torch.device("cuda", shard.local % torch.cuda.device_count())
     return device
 
 
-def _rows_there(items: Sequence[Item], options: DepthOptions, journal: Journal) -> dict[str, Row]:
-    """Rows of the pairs that an earlier run has finished, by name; records of all others do not count."""
-    there = dict[str, Row]()
+def _finished_rows(items: Sequence[Item], options: DepthOptions, journal: Journal) -> dict[str, Row]:
+    """Return the rows of pairs finished by an earlier run, by name; drop the records of all other pairs."""
+    finished = dict[str, Row]()
     for item in items:
         row = None if options.overwrite else finished_row(options_of(item.payload, options))
         if row is None:
             journal.forget(item)
             continue
-        there[item.key] = row
+        finished[item.key] = row
         if journal.get(item) is None:
             journal.put(item, row)
-    return there
+    return finished
 
 
 def _through(stages: Stages, runner: Runner) -> list[Row]:
-    """The records of all pairs, once they are through the stages."""
+    """Take all pairs through the stages and return their records."""
     try:
-        with _ends_run_if_all_would_fail():
+        with _ends_run_on_fatal_error():
             return runner.run(*stages.all, release=stages.release)
     except _EndsRun as ended:
         assert ended.__cause__ is not None
@@ -289,29 +292,29 @@ def _through(stages: Stages, runner: Runner) -> list[Row]:
 
 
 @contextmanager
-def _nothing_left_if_all_fail(journal: Journal) -> Iterator[None]:
-    """Remove the journal, and the folder that holds nothing else, where the run itself ends with an error."""
+def _cleaned_up_on_error(journal: Journal) -> Iterator[None]:
+    """Remove the journal, and the folder if it is empty otherwise, if the run itself ends with an error."""
     try:
         yield
     except InputError:
         with suppress(OSError):
-            journal.close()  # Windows removes no open file
+            journal.close()  # Windows does not remove open files
             if not any(path for path in journal.path.parent.iterdir() if path != journal.path):
                 journal.path.unlink()
                 journal.path.parent.rmdir()
         raise
 
 
-def _final(record: Row, there: Row | None, options: DepthOptions, tell: Tell) -> Row:
-    """A row of the table from a record of the journal, or from the report that an earlier run left."""
-    record = record | (there or {})
+def _final(record: Row, finished: Row | None, options: DepthOptions, notify: Notify) -> Row:
+    """Return a table row from a record of the journal, or from the report of an earlier run."""
+    record = record | (finished or {})
     row = {name: record.get(name) for name in COLUMNS} | {"pair": record["key"]}
     if record.get("status") == BROKEN:
         return row | {"result": "failed", "message": record["error"]}
     if not options.strict or record["verdict"] == "trusted":
-        return row | {"result": "there" if there else "done"}
+        return row | {"result": "kept" if finished else "done"}
     assert options.out is not None
     reason = f"The depth in {options.out / record['key']} is {record['verdict']}: {record['reasons']}"
-    tell(f"geodiff: {record['key']}: {reason}")  # --strict: it has failed
-    told = {"pair": record["key"], "result": "failed", "message": reason, "codes": record.get("codes")}
-    return dict.fromkeys(COLUMNS) | told
+    notify(f"geodiff: {record['key']}: {reason}")  # with --strict an untrusted pair counts as failed
+    reported = {"pair": record["key"], "result": "failed", "message": reason, "codes": record.get("codes")}
+    return dict.fromkeys(COLUMNS) | reported

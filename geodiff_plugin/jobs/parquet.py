@@ -1,7 +1,7 @@
-"""Results of many pairs as Parquet files, on a local disk or an object store (extra ``ray``).
+"""Stores results of many pairs as Parquet files, on a local disk or an object store (extra ``ray``).
 
-A file appears whole or not at all, under a name that its keys give, so that a task done again writes the same
-file again. Nothing keeps two runs from one folder: an object store has no locks.
+A file appears complete or not at all. Its name is derived from its keys, so a repeated task overwrites the
+same file. There is no lock against two runs on one folder: an object store has no locks.
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ import pyarrow.dataset as pds
 import pyarrow.parquet as pq
 from pyarrow import fs
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.jobs.finished import changed_options
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.rows import COLUMNS
 
-#: What a run was asked for, beside its files.
+#: File with the options of the run.
 JOB = "job.json"
-#: Begins the names of files with results.
+#: Prefix of files with results.
 RESULTS = "part-"
-#: Begins the names of files with errors, whose pairs the next run does again.
+#: Prefix of files with errors, whose pairs the next run retries.
 ERRORS = "errors-"
 KEY = pa.field("key", pa.string())
 SCHEMA = pa.schema([KEY, *(pa.field(name, pa.type_for_alias(alias)) for name, alias in COLUMNS.items())])
-#: A URI as ``Path`` leaves it, with one slash for two; a drive of Windows has one letter.
+#: Matches a URI in a ``Path``, which merges two slashes into one; a Windows drive has a single letter.
 URI = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)")
 
 
 @dataclass(frozen=True)
 class Store:
-    """A folder by its path or URI: of a local disk, or of any file system of pyarrow or fsspec."""
+    """A folder given by path or URI: on a local disk, or any file system of pyarrow or fsspec."""
 
     uri: str
 
     @classmethod
     def of(cls, options: DepthOptions) -> Self:
-        """That of ``--out``."""
+        """Return the store of ``--out``."""
         match = URI.fullmatch(str(options.out))
         if match is None:
             return cls(str(options.out))
         return cls(f"/{match[2]}" if match[1] == "file" else f"{match[1]}://{match[2]}")
 
     def open(self) -> tuple[fs.FileSystem, str]:
-        """The file system and the folder in it."""
+        """Return the file system and the folder in it."""
         if "://" not in self.uri:
             return fs.LocalFileSystem(), self.uri
         try:
@@ -64,7 +64,7 @@ class Store:
         return system, folder
 
     def _write(self, name: str, content: bytes) -> None:
-        """Write a file; on a disk by a rename, as an object appears when it is whole."""
+        """Write a file; on a disk by renaming, because an object appears only when complete."""
         system, folder = self.open()
         is_disk = isinstance(system, fs.LocalFileSystem)
         path = f"{folder}/{name}"
@@ -74,7 +74,7 @@ class Store:
                 file.write(content)
         except OSError:
             with suppress(OSError):
-                system.delete_file(temporary)  # what a full disk took of it
+                system.delete_file(temporary)  # partial content on a full disk
             raise
         if is_disk:
             system.move(temporary, path)
@@ -85,21 +85,21 @@ class Store:
         return sorted(info.base_name for info in found if info.type == fs.FileType.File)
 
     def begin(self, options: DepthOptions) -> set[str]:
-        """Make the folder, or take up the job in it; the keys that have results.
+        """Create the folder, or resume the job in it; return the keys that have results.
 
         Raises:
-            InputError: files of something else, or a job with other options.
+            InputError: the folder has other files, or a job with other options.
         """
         system, folder = self.open()
         names = self._names()
         if names and JOB not in names:
-            bad_value("--out", "a new or empty folder, or that of an earlier run", self.uri, "Name another.")
+            bad_value("--out", "a new or empty folder, or one of an earlier run", self.uri, "Choose another.")
         if JOB in names and not options.overwrite:
             with system.open_input_stream(f"{folder}/{JOB}") as file:
                 made = json.loads(file.read())
             if changes := changed_options(options, made):
-                cure = "Name another --out, or add --overwrite to repeat all pairs."
-                bad_value("--out", "that of a run with the same options", ", ".join(changes), cure)
+                hint = "Choose another --out, or add --overwrite to repeat all pairs."
+                bad_value("--out", "a folder of a run with the same options", ", ".join(changes), hint)
         system.create_dir(folder, recursive=True)
         for name in names:
             if name.startswith((".", ERRORS)) or (options.overwrite and name.startswith(RESULTS)):
@@ -108,14 +108,14 @@ class Store:
         return set() if options.overwrite else self.keys()
 
     def keys(self) -> set[str]:
-        """The keys of all results."""
+        """Return the keys of all results."""
         system, folder = self.open()
         files = [f"{folder}/{name}" for name in self._names() if name.startswith(RESULTS)]
         found = pds.dataset(files, schema=pa.schema([KEY]), format="parquet", filesystem=system)
         return set(found.to_table()["key"].to_pylist())
 
     def put(self, rows: pa.Table) -> pa.Table:
-        """Write rows with the columns of ``SCHEMA``; returns the key, verdict and error of each."""
+        """Write rows with the columns of ``SCHEMA``; return key, verdict and error of each."""
         table = rows.select(SCHEMA.names)
         failed = pc.is_valid(table["error"])
         parts = {RESULTS: table.filter(pc.invert(failed)), ERRORS: table.filter(failed)}

@@ -1,10 +1,10 @@
-"""Many pairs on Ray Data (extra ``ray``): read on CPUs, guide on actors that hold the prior, encode on CPUs.
+"""Many pairs on Ray Data (extra ``ray``): read and encode on CPUs, guide on actors that hold the prior.
 
 >>> rows = ray.data.from_items([{"key": "a", "left": "a_L.png", "right": "a_R.png", "calib": "calib.txt"}])
 >>> depth_dataset(rows, prior="prs-eth/marigold-depth-v1-1").write_parquet("s3://bucket/depth")
 
-A row that cannot be read, guided or encoded becomes a row with an ``error``, and the others go on. Ray does
-again what a lost worker had begun.
+A row that cannot be read, guided or encoded becomes a row with an ``error``, and the others continue. Ray
+reschedules the tasks of a lost worker.
 """
 
 from __future__ import annotations
@@ -17,33 +17,34 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 import ray
 import ray.data
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin._lazy import imported, uncollected
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin._internal.lazy import gc_frozen, imported
 from geodiff_plugin.jobs.failures import full_disk
+from geodiff_plugin.jobs.journal import Done
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef
 
 if TYPE_CHECKING:
     from geodiff_plugin.jobs.finished import Row
-    from geodiff_plugin.jobs.rows import ReadPair
+    from geodiff_plugin.jobs.records import ReadPair
 
-#: Share of a CPU for a task that reads or encodes. It differs from ``GUIDE_CPUS``, because Ray fuses stages
-#: that ask for the same, and would read inside the actor, while its GPU waits.
+#: CPUs per task that reads or encodes. Must differ from ``GUIDE_CPUS``: Ray fuses stages with equal requests,
+#: and would then read inside the actor while its GPU is idle.
 TASK_CPUS = 0.25
-#: Share of a CPU for an actor: where all CPUs guide, half of one is left for the tasks that feed it.
+#: CPUs per actor. If all CPUs guide, half of one remains for the tasks that feed the actor.
 GUIDE_CPUS = 0.5
-#: Most pairs that one task reads: with their images they are some 100 MB.
-MOST_ROWS = 8
-#: Most blocks of rows, of each of which the driver keeps track.
-MOST_BLOCKS = 20_000
-#: Column of what one stage hands to the next: pickled, as all objects in Ray are, but as bytes, of which Ray
-#: knows the size.
+#: Maximum number of pairs that one task reads: with their images they are about 100 MB.
+MAX_ROWS = 8
+#: Maximum number of blocks of rows, because the driver tracks each of them.
+MAX_BLOCKS = 20_000
+#: Column with the state passed between stages: pickled like all objects in Ray, but as bytes, whose size Ray
+#: knows.
 STATE = "geodiff_state"
 
 
@@ -52,16 +53,16 @@ class Workers:
     """The actors that hold the prior.
 
     Attributes:
-        count: how many; without it as many as the cluster has room for.
-        gpus: GPUs of each, also a fraction, such as 0.5 for two actors on a card. Without it 1 where the
-            cluster has any, else 0.
+        count: number of actors (default: as many as fit in the cluster).
+        gpus: GPUs per actor, possibly a fraction, such as 0.5 for two actors per GPU. Default: 1 if the
+            cluster has any, otherwise 0.
     """
 
     count: int | None = None
     gpus: float | None = None
 
-    def most(self) -> int:
-        """How many there may be, in a cluster that is connected."""
+    def max_count(self) -> int:
+        """Maximum number of actors in the connected cluster."""
         if self.count is not None:
             return self.count
         resources, gpus = ray.cluster_resources(), self._gpus()
@@ -70,20 +71,22 @@ class Workers:
         return max(1, int(resources.get("CPU", 1.0) / (GUIDE_CPUS + 2 * TASK_CPUS)))
 
     def for_rows(self, rows: int) -> Workers:
-        """No more of them than there are rows."""
-        return self if self.most() <= rows else replace(self, count=max(1, rows))
+        """Return workers limited to the number of rows."""
+        return self if self.max_count() <= rows else replace(self, count=max(1, rows))
 
-    def stages_beside(self) -> Row:
-        """Arguments of ``Dataset.map`` for a stage of tasks that feed these actors, or take what they give.
+    def task_arguments(self) -> Row:
+        """Return arguments of ``Dataset.map`` for tasks that read for these actors or encode their results.
 
-        Where CPUs guide, one task of a stage for each actor is enough; every further one would load torch.
+        If CPUs guide, one task per stage and actor is enough; each further task would load torch.
         """
-        most = None if self._gpus() else self.most()
-        return {"num_cpus": TASK_CPUS, "compute": ray.data.TaskPoolStrategy(most)}
+        size = None if self._gpus() else self.max_count()
+        return {"num_cpus": TASK_CPUS, "compute": ray.data.TaskPoolStrategy(size)}
 
     def arguments(self) -> Row:
-        """Arguments of ``Dataset.map`` that ask Ray for these actors."""
-        size: Row = {"min_size": 1, "max_size": self.most()} if self.count is None else {"size": self.count}
+        """Return arguments of ``Dataset.map`` that request these actors."""
+        size: Row = (
+            {"min_size": 1, "max_size": self.max_count()} if self.count is None else {"size": self.count}
+        )
         compute = ray.data.ActorPoolStrategy(**size)
         return {"compute": compute, "num_cpus": GUIDE_CPUS, "num_gpus": self._gpus() or None}
 
@@ -94,30 +97,30 @@ class Workers:
 
 
 def depth_dataset(ds: Any, *, workers: Workers = Workers(), **options: Any) -> Any:
-    """Metric depth of every row of a Ray dataset, as a dataset.
+    """Compute metric depth of every row of a Ray dataset.
 
     Args:
         ds: rows with ``key`` (text), ``left`` and ``right`` (paths, or the bytes of image files), and the
-            cameras in one of three ways: ``calib`` (a path or a list of paths); the numbers ``fx``, ``fy``,
+            cameras in one of three forms: ``calib`` (a path or a list of paths); the numbers ``fx``, ``fy``,
             ``cx``, ``cy`` in pixels and ``baseline`` in metres; or the matrices ``K_left`` (9 numbers), ``E``
             (16, the pose of the right camera in the left one's frame) and, if it differs, ``K_right``. Any
-            other option of ``DepthOptions`` may be a column too, and goes before ``options``. Columns with
+            other option of ``DepthOptions`` may be a column too, and overrides ``options``. Columns with
             other names are kept. Paths must be readable on every machine of the cluster.
         workers: the actors that hold the prior.
-        **options: of ``DepthOptions``, the same for all rows, such as ``prior`` and ``steps``.
+        **options: options of ``DepthOptions`` for all rows, such as ``prior`` and ``steps``.
 
     Returns:
         A lazy dataset: the columns of ``ds`` without the images, and ``rows.COLUMNS``. ``depth_mm`` is a
-        16-bit PNG of millimetres (thousandths of ``unit`` where that is not metres), 0 where depth is beyond
-        65.535 m. ``confidence`` is an 8-bit PNG of 255ths, or ``None`` where none is measured. Both are
-        ``height`` x ``width``; ``fx`` to ``cy`` are in their pixels; ``codes`` are those of
-        ``geodiff_plugin.messages``. ``error`` says why a row has no depth; all other columns of the result
-        are ``None`` then.
+        16-bit PNG of millimetres (thousandths of ``unit`` if that is not metres), 0 for depth beyond
+        65.535 m. ``confidence`` is an 8-bit PNG of 255ths, or ``None`` if not measured. Both are
+        ``height`` x ``width``; ``fx`` to ``cy`` are in their pixels; ``codes`` are defined in
+        ``geodiff_plugin.findings``. ``error`` states why a row has no depth; all other columns of its result
+        are ``None``.
 
     Raises:
-        InputError: options that do not exist.
+        InputError: unknown options.
 
-    Every call takes one pair, so that the result of a row does not depend on the rows beside it.
+    Every call processes one pair, so the result of a row does not depend on other rows.
     """
     imported("jobs.rows.check_names")(options)
     base = DepthOptions(left=Path(), **options)
@@ -125,41 +128,41 @@ def depth_dataset(ds: Any, *, workers: Workers = Workers(), **options: Any) -> A
 
 
 def guided_refs(refs: Sequence[PairRef], options: DepthOptions, workers: Workers) -> Any:
-    """A dataset with a row for each pair of a command, which holds a ``GuidedPair`` for ``attempt``.
+    """Return a dataset with a row for each pair of a command, which holds a ``PairRun`` for ``attempt``.
 
     Args:
-        refs: of ``start_many``.
-        options: of the command.
-        workers: the actors, which the blocks of rows are enough to keep busy.
+        refs: pairs from ``start_many``.
+        options: options of the command.
+        workers: the actors, whose number determines the number of blocks.
     """
     workers = workers.for_rows(len(refs))
-    each = min(MOST_ROWS, max(1, len(refs) // (4 * workers.most())))
-    blocks = min(MOST_BLOCKS, ceil(len(refs) / each))
+    each = min(MAX_ROWS, max(1, len(refs) // (4 * workers.max_count())))
+    blocks = min(MAX_BLOCKS, ceil(len(refs) / each))
     rows = [{"key": ref.name, STATE: pickle.dumps(ref)} for ref in refs]
     ds = ray.data.from_items(rows, override_num_blocks=blocks)
     return _guided(ds, partial(_read_ref, options), options, workers)
 
 
 def _guided(ds: Any, read: Callable[[Row], ReadPair], options: DepthOptions, workers: Workers) -> Any:
-    rows = ds.map(partial(_read, read), **workers.stages_beside())
+    rows = ds.map(partial(_read, read), **workers.task_arguments())
     return rows.map(_Guide, fn_constructor_args=(options,), **workers.arguments())
 
 
 def encoded(runs: Any, workers: Workers) -> Any:
-    """The rows of a dataset of ``GuidedPair`` as those of ``depth_dataset``."""
-    beside = workers.stages_beside()
-    return runs.map(_encode, **beside).map_batches(_typed, batch_format="pyarrow", **beside)
+    """Convert a dataset of ``PairRun`` to the rows of ``depth_dataset``."""
+    arguments = workers.task_arguments()
+    return runs.map(_encode, **arguments).map_batches(_typed, batch_format="pyarrow", **arguments)
 
 
 def attempt(row: Row, work: Callable[[Any], Any]) -> tuple[Row, Any]:
-    """Do the work of a stage on what the one before handed over.
+    """Run a stage on the state passed by the previous one.
 
     Returns:
-        The row without ``STATE``, and the result. Where the row has an error, or gets one here, the result is
+        The row without ``STATE``, and the result. If the row has an error, or gets one here, the result is
         ``None``.
 
     Raises:
-        InputError: the disk is full, which ends the run.
+        InputError: a full disk, which ends the run.
     """
     kept = {name: value for name, value in row.items() if name != STATE}
     if row["error"] is not None:
@@ -171,12 +174,12 @@ def attempt(row: Row, work: Callable[[Any], Any]) -> tuple[Row, Any]:
 
 
 def _message(error: Exception) -> str:
-    """What a row says of its error; that of a full disk is raised."""
+    """Return the message of a row's error; raise if the disk is full."""
     if (full := full_disk(error)) is not None:
         raise full from error
     if isinstance(error, (InputError, OSError, ValueError)):
         return str(error)
-    traceback.print_exception(error, file=sys.stderr)  # a defect of ours: it belongs in the log of the worker
+    traceback.print_exception(error, file=sys.stderr)  # an internal error, for the worker's log
     return f"{type(error).__name__}: {error}"
 
 
@@ -184,25 +187,25 @@ def _hand_over(kept: Row, state: Any) -> Row:
     return kept | {STATE: b"" if state is None else pickle.dumps(state)}
 
 
-def _in_worker(where: str) -> Any:
-    """What a stage needs, by its dotted name, imported when the stage begins.
+def _imported_in_worker(where: str) -> Any:
+    """Import and return the object of this package with a dotted name, such as ``jobs.rows.read_ref``.
 
-    This module itself imports little, so that what tasks need is not all that an actor needs.
+    The stages import what they need in the worker process, so that tasks do not load what only actors need.
     """
-    with uncollected():
+    with gc_frozen():
         return imported(where)
 
 
 def _read_columns(base: DepthOptions, row: Row) -> ReadPair:
-    return _in_worker("jobs.rows.read_columns")(base, row)
+    return _imported_in_worker("jobs.rows.read_columns")(base, row)
 
 
 def _read_ref(options: DepthOptions, row: Row) -> ReadPair:
-    return _in_worker("jobs.rows.read_ref")(options, pickle.loads(row[STATE]))
+    return _imported_in_worker("jobs.rows.read_ref")(options, pickle.loads(row[STATE]))
 
 
 def _read(read: Callable[[Row], ReadPair], row: Row) -> Row:
-    inputs = {*_in_worker("jobs.rows.IMAGES"), STATE}
+    inputs = {*_imported_in_worker("jobs.rows.IMAGES"), STATE}
     kept = {name: value for name, value in row.items() if name not in inputs}
     pair, error = None, None
     try:
@@ -213,40 +216,32 @@ def _read(read: Callable[[Row], ReadPair], row: Row) -> Row:
 
 
 class _Guide:
-    """An actor: it holds the prior, and makes the guided calls."""
+    """Actor that holds the prior and makes the guided calls."""
 
     def __init__(self, options: DepthOptions) -> None:
-        self._prior = _in_worker("jobs.actor.PriorOfJob")(options)
+        self._prior = _imported_in_worker("jobs.actor.PriorOfJob")(options)
 
     def __call__(self, row: Row) -> Row:
         return _hand_over(*attempt(row, self._prior.guide))
 
 
 def _encode(row: Row) -> Row:
-    """The row of a result; of a pair that failed the columns are empty, and the error says why."""
-    kept, columns = attempt(row, _in_worker("jobs.rows.result_columns"))
-    empty = dict.fromkeys(_in_worker("jobs.rows.COLUMNS"))
+    """Return the row of a result; for a failed pair the columns are empty, and ``error`` states why."""
+    kept, columns = attempt(row, _imported_in_worker("jobs.rows.result_columns"))
+    empty = dict.fromkeys(_imported_in_worker("jobs.rows.COLUMNS"))
     return kept | empty | (columns or {"error": kept["error"]})
 
 
 def _typed(table: pa.Table) -> pa.Table:
-    """The columns of a result in their types, also where all rows of a batch have failed."""
-    for name, alias in _in_worker("jobs.rows.COLUMNS").items():
+    """Cast the columns of a result to their types, also if all rows of a batch failed."""
+    for name, alias in _imported_in_worker("jobs.rows.COLUMNS").items():
         values = table[name].cast(pa.type_for_alias(alias))
         table = table.set_column(table.schema.get_field_index(name), name, values)
     return table
 
 
-class Done(NamedTuple):
-    """A piece of work that has been done: its record, or the error that it ended with."""
-
-    key: str
-    record: Row | None
-    error: str | None
-
-
 class _Worker:
-    """An actor that does by key what ``make`` gives it."""
+    """Actor that calls the function from ``make`` with keys."""
 
     def __init__(self, make: Callable[[], Callable[[str], Row]]) -> None:
         self._record_of = make()
@@ -261,11 +256,11 @@ class _Worker:
 def on_actors(
     keys: Sequence[str], make: Callable[[], Callable[[str], Row]], workers: Workers
 ) -> Iterator[Done]:
-    """Do the work of every key on actors, and give what became of it, in the order in which it is done.
+    """Process every key on actors, and yield the outcomes in order of completion.
 
-    Each actor calls ``make`` once, which returns the function from a key to its record.
+    ``make`` is called once per actor and returns the function from a key to its record.
     """
-    blocks = min(len(keys), MOST_BLOCKS)
+    blocks = min(len(keys), MAX_BLOCKS)
     rows: Any = ray.data.from_items([{"key": key} for key in keys], override_num_blocks=blocks)
     arguments = workers.for_rows(len(keys)).arguments()
     for row in rows.map(_Worker, fn_constructor_args=(make,), **arguments).iter_rows():

@@ -1,4 +1,4 @@
-"""Records of a pair on its way from its files to its folder."""
+"""Records of a pair at each step from its files to its output folder."""
 
 from __future__ import annotations
 
@@ -9,39 +9,86 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from geodiff_plugin._checks import noted
+import numpy as np
+
+from geodiff_plugin._internal.checks import captured_warnings
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.findings import Finding, dedupe
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.reading import PairInputs
-from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.result.output import MetricDepthOutput
+from geodiff_plugin.types import Rig
 
 
 @dataclass
 class JobLog:
-    """Wall-clock seconds of the stages of a job, in their order, and every message that they warned of."""
+    """Wall-clock seconds of the stages of a job, in order, and all findings that they reported."""
 
     seconds: dict[str, float] = field(default_factory=dict)
-    warnings: list[Message] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time what is inside, and note what it warns of."""
+        """Time the block, and record its warnings."""
         started = time.perf_counter()
-        with noted() as warned:
+        with captured_warnings() as warned:
             yield
         self.seconds[name] = time.perf_counter() - started
         self.add(warned)
 
-    def add(self, messages: Iterable[Message]) -> None:
-        """Note messages beside those of the stages, each sentence once."""
-        self.warnings = list(distinct(self.warnings, messages))
+    def add(self, findings: Iterable[Finding]) -> None:
+        """Add findings to the stages' findings, each message once."""
+        self.findings = list(dedupe(self.findings, findings))
+
+
+@dataclass(frozen=True, eq=False)
+class PairInputs:
+    """Inputs of a pair.
+
+    Attributes:
+        left: the left view ``(H, W, 3)`` in [0, 1], without lens distortion.
+        rig: cameras of the left and right view.
+        guidance: the guidance, with all other views.
+        undistorted: whether lens distortion was removed from any view.
+        prior_map: ``(h, w)``, NaN where unknown; ``None`` without ``--prior-map``.
+        cameras: cameras of all views as taken, with their lenses, left one first.
+    """
+
+    left: np.ndarray
+    rig: Rig
+    guidance: GeometryGuidance
+    undistorted: bool = False
+    prior_map: np.ndarray | None = None
+    cameras: tuple[Camera, ...] = ()
+
+
+@dataclass(frozen=True)
+class PairOrigin:
+    """Identifies a pair of a run over many, with the SHA-256 of its files by path.
+
+    ``frame`` is its number in a video or bag, ``None`` for images.
+    """
+
+    name: str
+    frame: int | None
+    sha256: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class ReadPair:
+    """A pair whose inputs were read; ``origin`` is ``None`` for a run over one pair."""
+
+    options: DepthOptions
+    inputs: PairInputs
+    log: JobLog
+    origin: PairOrigin | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PairRun:
-    """A pair that has been read and guided.
+    """A pair after the guided call.
 
-    ``prior`` says what ran: the pipeline's name, class, scheduler, device and dtype.
+    ``prior`` describes the prior: name and class of the pipeline, scheduler, device and dtype.
     """
 
     options: DepthOptions
@@ -49,11 +96,12 @@ class PairRun:
     output: MetricDepthOutput
     prior: dict[str, str]
     log: JobLog
+    origin: PairOrigin | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PairResult:
-    """A pair whose results lie in ``folder``, with the content of its ``report.json``."""
+    """A pair whose results are in ``folder``, with the content of its ``report.json``."""
 
     run: PairRun
     folder: Path

@@ -1,8 +1,7 @@
-"""Whether pictures are rectified or as they were taken, where their calibration describes both.
+"""Detects whether images are rectified or raw if their calibration describes both.
 
-OpenCV's samples, ROS and ORB-SLAM write the cameras as they stand and what rectification makes of them into
-one file, and nothing says which pictures a user has. Matches of the pictures lie on the epipolar lines of one
-of the two.
+OpenCV's samples, ROS and ORB-SLAM write the cameras before and after rectification into one file, which does
+not state which images it belongs to. Matches between the images lie on the epipolar lines of one of the two.
 """
 
 from __future__ import annotations
@@ -13,70 +12,57 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import warn
-from geodiff_plugin.formats.lenses import undistorted_pixels
-from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.tracks import (
-    FEWEST,
-    LONG_SIDE,
-    Tracks,
-    epipolar,
-    grey_image,
-    rays_through,
-    sparse_tracks,
-)
+from geodiff_plugin._internal.checks import warn
+from geodiff_plugin.cameras import Camera, resized_px
+from geodiff_plugin.findings import Finding
+from geodiff_plugin.pose.tracks import MIN_MATCHES, Tracks, epipolar, reduced_grey, sparse_tracks
 from geodiff_plugin.types import Rig
 
-#: Wrong matches lie anywhere, so the better half of all is looked at, by its middle.
+#: Quantile of the residuals for the comparison: the median of the better half, because outliers are
+#: arbitrary.
 QUANTILE = 0.25
-#: The pictures may be as taken where the cameras as they stand leave matches within so many pixels of their
-#: epipolar lines.
-MOST_RESIDUAL_PX = 2.0
-#: Then they are as taken if the rectified cameras leave the matches farther off by this factor.
-FURTHER_OFF = 3.0
+#: Maximum residual in pixels for raw images.
+MAX_RESIDUAL_PX = 2.0
+#: Images are raw if the residual of the rectified cameras is larger by this factor.
+MIN_RATIO = 3.0
 
 
-def fitting_rig(rig: Rig, images_01: Sequence[np.ndarray]) -> Rig:
-    """The rig, or ``rig.as_taken`` where the first two of ``images_01 (H, W, 3)`` fit that better."""
+def select_rig(rig: Rig, images_01: Sequence[np.ndarray]) -> Rig:
+    """Return the rig, or ``rig.as_taken`` if it fits the first two of ``images_01 (H, W, 3)`` better."""
     if rig.as_taken is None or len(images_01) < 2:
         return rig
-    left, right = _matches(images_01[0], images_01[1])
-    if len(left) < FEWEST:
+    left, right = _matches(rig, images_01)
+    if len(left) < MIN_MATCHES:
         return rig
     rectified_px, taken_px = (off_lines_px(each, left, right) for each in (rig, rig.as_taken))
-    if taken_px > MOST_RESIDUAL_PX or rectified_px < FURTHER_OFF * taken_px:
+    if taken_px > MAX_RESIDUAL_PX or rectified_px < MIN_RATIO * taken_px:
         return rig
     sentence = (
-        f"{rig.source} describes the pictures as they were taken and rectified ones, and these are as taken: "
-        f"matches lie {taken_px:.1f} px off their lines, {rectified_px:.1f} px if they were rectified."
+        f"{rig.source} describes raw and rectified images. The given images are raw: matches lie "
+        f"{taken_px:.1f} px off their epipolar lines, {rectified_px:.1f} px if they were rectified."
     )
-    warn(Message("calibration.as-taken", sentence))
+    warn(Finding("calibration.unrectified", sentence))
     return replace(rig.as_taken, source=rig.source)
 
 
-def _matches(left_01: np.ndarray, right_01: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels ``(N, 2)`` of both pictures in which they match."""
-    views = []
-    for image_01 in (left_01, right_01):
-        image = torch.from_numpy(image_01).permute(2, 0, 1)
-        views.append(grey_image(image, torch.eye(3), min(1.0, LONG_SIDE / max(image_01.shape[:2]))))
+def _matches(rig: Rig, images_01: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the pixels ``(N, 2)`` of matches in both images ``(H, W, 3)``."""
+    pair = images_01[:2]
+    views = [
+        reduced_grey(torch.from_numpy(image).permute(2, 0, 1), Camera(camera.K))
+        for image, camera in zip(pair, (rig.left, rig.right), strict=True)
+    ]
     tracks = sparse_tracks(views)
-    # With K = 1 the rays of the reduced images are pixels of the images themselves.
-    left = rays_through(tracks.left_px, tracks.K_left)
-    right = rays_through(tracks.right_px[0], tracks.K_rights[0])
-    return left[:, :2], right[:, :2]
+    return [
+        resized_px(px, view.grey.shape[::-1], image.shape[1::-1])
+        for px, view, image in zip((tracks.left_px, tracks.right_px[0]), views, pair, strict=True)
+    ]
 
 
 def off_lines_px(rig: Rig, left: np.ndarray, right: np.ndarray) -> float:
-    """How far the better half of matches ``(N, 2)`` lies off its epipolar lines, pixels, by its middle."""
-    Ks = rig.K_left, rig.K_right
-    straight = [
-        pixels if lens is None else undistorted_pixels(pixels, K, lens)
-        for pixels, K, lens in zip((left, right), Ks, rig.distortion, strict=True)
-    ]
-    tracks = Tracks(
-        straight[0], straight[1][None], np.ones((1, len(left)), bool), rig.K_left, rig.K_right[None]
-    )
+    """Return the distance of matches ``(N, 2)`` from their epipolar lines in pixels, at ``QUANTILE``."""
+    left, right = rig.left.undistorted_px(left), rig.right.undistorted_px(right)
+    tracks = Tracks(left, right[None], np.ones((1, len(left)), bool), rig.K_left, rig.K_right[None])
     with np.errstate(invalid="ignore"):  # a lens may not see a pixel
         off_px = np.abs(epipolar(tracks, rig.T_right_from_left).off_px)
     return float(np.quantile(np.nan_to_num(off_px, nan=np.inf), QUANTILE))

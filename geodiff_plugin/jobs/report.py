@@ -1,11 +1,10 @@
-"""The report of a pair, ``report.json``, and the line that sums it up."""
+"""Builds the report of a pair, ``report.json``, and its summary line."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +12,21 @@ import numpy as np
 import torch
 
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.formats.out import REPORT
+from geodiff_plugin.findings import Severity, as_records
+from geodiff_plugin.formats import REPORT
 from geodiff_plugin.jobs.records import PairRun
-from geodiff_plugin.messages import Message, as_records
-from geodiff_plugin.result.misfit import expected_error, misfit_of
 from geodiff_plugin.result.output import MetricDepthOutput
-from geodiff_plugin.result.standing import standing_words
 from geodiff_plugin.runtime.machine import versions
-from geodiff_plugin.types import UNTESTED
+from geodiff_plugin.trust import (
+    UNTESTED,
+    KnownPoints,
+    MatchedFraction,
+    summary_words,
+)
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """The report of a result; empty where there is none, or none that can be read."""
+    """Read the report of a result; empty if it is missing or unreadable."""
     try:
         report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -32,25 +34,61 @@ def read_report(folder: Path) -> dict[str, Any]:
     return report if isinstance(report, dict) else {}
 
 
+def valid_depth(folder: Path) -> np.ndarray:
+    """Read the depth map of a result, ``(H, W)`` metres; 0 marks invalid pixels (confidence 0)."""
+    depth_m: np.ndarray = np.load(folder / "depth.npy", allow_pickle=False)
+    confidence = folder / "confidence.npy"
+    return depth_m * (np.load(confidence, allow_pickle=False) > 0) if confidence.is_file() else depth_m
+
+
+def known_sigma(folder: Path) -> np.ndarray | None:
+    """Read the standard deviation of a result's depth, ``(H, W)`` metres; ``None`` if it has none."""
+    path = folder / "sigma.npy"
+    return np.load(path, allow_pickle=False) if path.is_file() else None
+
+
 def report_text(report: dict[str, Any]) -> str:
-    """A report as its file has it."""
+    """Format a report for its file."""
     return json.dumps(report, indent=2, allow_nan=False)
 
 
 def single_map(value: Any) -> np.ndarray:
-    """The ``(H, W)`` map of the one image of a call."""
+    """Return the ``(H, W)`` map of a call with one image."""
     return np.asarray(value)[0, ..., 0]
 
 
-def depth_summary(depth_m: np.ndarray, visible: np.ndarray | None) -> dict[str, Any]:
-    """Near, far, median of ``(H, W)`` metres over valid pixels; shares and counts over all."""
-    valid = np.isfinite(depth_m) & (depth_m > 0)
-    kept = depth_m[valid] if valid.any() else np.array([math.nan])
+def output_summary(output: MetricDepthOutput) -> dict[str, Any]:
+    """Return the ``depth_summary`` of an output with one image."""
+    visible = None if output.visible is None else single_map(output.visible)
+    measurable_m = None if output.measurable_m is None else float(output.measurable_m[0])
+    return depth_summary(single_map(output.prediction), visible, single_map(output.valid), measurable_m)
+
+
+def depth_summary(
+    depth_m: np.ndarray,
+    visible: np.ndarray | None,
+    valid: np.ndarray | None = None,
+    measurable_m: float | None = None,
+) -> dict[str, Any]:
+    """Return near, far and median of ``(H, W)`` metres over valid pixels; count and fraction over all.
+
+    Depth beyond ``measurable_m``, as of the sky, was not measured and is not a maximum. If there is any,
+    ``beyond_m`` is that limit, ``beyond_fraction`` its fraction of all pixels, and ``max_m`` is the farthest
+    depth before it.
+    """
+    has_depth = np.isfinite(depth_m) & (depth_m > 0)
+    valid = has_depth if valid is None else has_depth & valid
+    beyond = has_depth & (depth_m > (math.inf if measurable_m is None else measurable_m))
+    kept, measured = (
+        depth_m[mask] if mask.any() else np.array([math.nan]) for mask in (valid, valid & ~beyond)
+    )
     return {
         "min_m": float(kept.min()),
         "median_m": float(np.median(kept)),
         "mean_m": float(kept.mean()),
-        "max_m": float(kept.max()),
+        "max_m": float(measured.max()),
+        "beyond_m": measurable_m if beyond.any() else None,
+        "beyond_fraction": float(beyond.mean()),
         "width": depth_m.shape[1],
         "height": depth_m.shape[0],
         "invalid_pixels": int((~valid).sum()),
@@ -59,7 +97,7 @@ def depth_summary(depth_m: np.ndarray, visible: np.ndarray | None) -> dict[str, 
 
 
 def plain(value: Any) -> Any:
-    """Tensors and arrays as lists, numbers that JSON has no name for as ``None``."""
+    """Convert tensors and arrays to lists, and non-finite numbers to ``None``, for JSON."""
     if isinstance(value, dict):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -72,50 +110,52 @@ def plain(value: Any) -> Any:
 
 
 def used_poses(output: MetricDepthOutput, guidance: GeometryGuidance) -> tuple[np.ndarray, ...]:
-    """``(4, 4)`` poses of the further views in the output's unit; the refined ones, which the depth fits."""
+    """Return the ``(4, 4)`` poses of the further views in the output's unit; refined poses if available."""
     if output.poses and output.poses[0].status == "refined":
         return output.poses[0].E
     return tuple(_rescaled(rig.E, output) for rig in guidance.rigs)
 
 
 def _rescaled(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
-    """A pose of the guidance in the unit of the output."""
+    """Convert a pose of the guidance to the unit of the output."""
     rescaled = np.array(E)
     rescaled[:3, 3] *= output.rescaled
     return rescaled
 
 
 def verdict_report(output: MetricDepthOutput) -> dict[str, Any]:
-    """The verdict as reports have it; for one release its indicators also have their former names."""
-    verdict: dict[str, Any] = plain(asdict(output.verdict))
-    former = {"order" if name == "rank_correlation" else name: x for name, x in verdict["indicators"].items()}
-    return verdict | {"signs": former}
-
-
-def messages_of(output: MetricDepthOutput, *more: Iterable[Message]) -> list[dict[str, Any]]:
-    """Every message on a result of one image, with its code, as reports have them."""
+    """Return the verdict as in reports, with the facts of its checks by name."""
     verdict = output.verdict
-    return as_records(verdict.reasons, verdict.remarks, output.warnings, output.assumed, *more)
+    facts = plain(verdict.facts.as_record())
+    return {
+        "status": verdict.status,
+        "reasons": list(verdict.reasons),
+        "remarks": list(verdict.remarks),
+        "facts": facts,
+    }
+
+
+def severities(report: dict[str, Any]) -> set[str]:
+    """Return the severities of the findings of a report."""
+    return {finding["severity"] for finding in report.get("findings", ())}
 
 
 def build_report(run: PairRun) -> dict[str, Any]:
-    """The report of a pair without seconds and files, which are known when everything else is written."""
+    """Build the report of a pair, without seconds and files, which are added last."""
     output, guidance = run.output, run.inputs.guidance
-    depth_m, visible, error = single_map(output.prediction), None, math.nan
+    error = math.nan
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
         error = float(single_map(output.photometric_error)[visible].mean()) if visible.any() else math.nan
     spread = output.uncertainty
-    names = ("K", "scale", "shift", "global_scale", "prior_scale", "prior_error", "unit", "assumed")
-    cameras = guidance.inputs[0].K_left, used_poses(output, guidance)
-    found = output.verdict.indicators
-    misfit = misfit_of(found, depth_m.shape)
-    expected_m = expected_error(depth_m, *cameras, np.nan_to_num(found.scale_spread), misfit)
+    names = ("K", "scale", "shift", "global_scale", "prior_scale", "prior_error", "unit")
+    sigma = None if output.sigma is None else single_map(output.sigma)
+    known = None if sigma is None else sigma[np.isfinite(sigma)]
     report = {
-        "depth": depth_summary(depth_m * single_map(output.valid), visible),
+        "depth": output_summary(output),
         "verdict": verdict_report(output),
         "photometric_error_mean": error,
-        "expected_error_median_m": np.median(expected_m),
+        "sigma_median_m": None if known is None or not known.size else np.median(known),
         "uncertainty_median_m": None if spread is None else np.median(single_map(spread)),
         **{name: getattr(output, name) for name in names},
         "history": [vars(step) for step in output.history],
@@ -123,14 +163,13 @@ def build_report(run: PairRun) -> dict[str, Any]:
         "pose": vars(output.poses[0]) if output.poses else None,
         "guidance": guidance.as_run().to_dict(),
         "versions": versions(),
-        "warnings": run.log.warnings,
-        "messages": messages_of(output, run.log.warnings, run.inputs.notes),
+        "findings": as_records(output.findings, run.log.findings),
         "undistorted": run.inputs.undistorted,
         "inputs": _cameras(run),
         "prior": run.prior,
         "arguments": run.options.as_json(),
     }
-    return plain(report)
+    return plain(report if run.origin is None else report | {"pair": vars(run.origin)})
 
 
 def _estimated_pose(output: MetricDepthOutput, guidance: GeometryGuidance) -> dict[str, Any] | None:
@@ -138,12 +177,12 @@ def _estimated_pose(output: MetricDepthOutput, guidance: GeometryGuidance) -> di
     if estimated is None:
         return None
     measures = ("inliers", "parallax_deg", "residual_px", "depth_spread")
-    scale = {"scale_from": output.scale_from, "scale_spread": output.scale_spread}
-    return {name: getattr(estimated, name) for name in measures} | scale | {"assumed": estimated.notes}
+    scale = {"scale_from": output.scale_from, "scale_rel_std": output.scale_rel_std}
+    return {name: getattr(estimated, name) for name in measures} | scale
 
 
 def _cameras(run: PairRun) -> dict[str, Any]:
-    """The cameras as they were understood, lengths in the output's unit."""
+    """Return the cameras that were used, with lengths in the output's unit."""
     rig, output, further = run.inputs.rig, run.output, run.inputs.guidance.rigs[1:]
     return {
         "left_size": rig.size_left,
@@ -158,31 +197,43 @@ def _cameras(run: PairRun) -> dict[str, Any]:
 
 
 def _length(value: float, unit: str | None) -> str:
-    """Two decimals, or two digits of what is too small for them."""
+    """Format with two decimals, or two significant digits if smaller."""
     number = f"{value:.2f}" if value >= 0.1 else f"{value:.2g}"
     return number if unit is None else f"{number} {unit}"
 
 
+def depth_range_words(depth: Mapping[str, Any], unit: str | None) -> str:
+    """Format the range of a ``depth_summary``, such as ``3.24 m to beyond 71 m``."""
+    near, beyond_m = _length(depth["min_m"], unit), depth.get("beyond_m")
+    if beyond_m is None:
+        return f"{near} to {_length(depth['max_m'], unit)}"
+    far = f"beyond {float(f'{beyond_m:.2g}'):g}" + ("" if unit is None else f" {unit}")
+    nothing_measured = depth["max_m"] is None or math.isnan(depth["max_m"])
+    return far if nothing_measured else f"{near} to {far}"
+
+
 def summary_line(report: dict[str, Any], where: str) -> str:
-    """One line for people: near, far, median and what they rest on; where not trusted, the verdict first."""
+    """Summarise a report in one line: near, far, median, evidence; first the verdict if not trusted."""
     depth, verdict = report["depth"], report["verdict"]
     end = f"{sum(report['seconds'].values()):.1f} s -> {where}"
     if depth["median_m"] is None:
         return f"no valid depth; {end}"
-    near, far, median = (_length(depth[name], report["unit"]) for name in ("min_m", "max_m", "median_m"))
-    metres = f"{near} to {far}, median {median}"
+    metres = (
+        f"{depth_range_words(depth, report['unit'])}, median {_length(depth['median_m'], report['unit'])}"
+    )
     if report["unit"] is None:
-        of = "baselines" if report.get("estimated_pose") else "the calibration's lengths"
-        metres += f", in {of} (no unit)"
+        lengths = "baselines" if report.get("estimated_pose") else "the calibration's lengths"
+        metres += f", in {lengths} (no unit)"
     if verdict["status"] != "trusted":
         reason = verdict["reasons"][0] if verdict["reasons"] else f"{UNTESTED}."
-        return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {end})"
-    found, prior_scale = verdict["indicators"], report["prior_scale"]
-    error = report.get("expected_error_median_m")
-    trusted = [standing_words(verdict["status"], bool(report.get("assumed")))]
-    trusted += [] if found["confidence"] is None else [f"confidence {found['confidence']:.2f}"]
-    trusted += [] if error is None else [f"expected error {_length(error, report['unit'])}"]
-    trusted += [] if found["matched"] is None else [f"{100 * found['matched']:.0f} % matched"]
-    trusted += [f"{found['points']} known depths"] if found["points"] else []
-    scale = [] if prior_scale is None else [f"prior's own metres x {prior_scale[0][0]:.2f}"]
+        return f"{verdict['status'].upper()}: {reason} (Unreliable: {metres}; {end})"
+    facts, prior_scale = verdict["facts"], report["prior_scale"]
+    found, points = facts.get(MatchedFraction.name(), {}), facts.get(KnownPoints.name(), {})
+    sigma = report.get("sigma_median_m")
+    trusted = [summary_words(verdict["status"], Severity.ASSUMPTION.value in severities(report))]
+    trusted += [] if found.get("confidence") is None else [f"confidence {found['confidence']:.2f}"]
+    trusted += [] if sigma is None else [f"median sigma {_length(sigma, report['unit'])}"]
+    trusted += [] if found.get("matched") is None else [f"{100 * found['matched']:.0f} % matched"]
+    trusted += [f"{points['count']} known depths"] if points.get("count") else []
+    scale = [] if prior_scale is None else [f"prior's metric scale x {prior_scale[0][0]:.2f}"]
     return "; ".join([metres, ", ".join(trusted), *scale, end])

@@ -1,4 +1,4 @@
-"""What is made of finished results: a video of their depth, and the files of a benchmark."""
+"""Converts finished results into a depth video or benchmark files."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from geodiff_plugin import formats, plotting
-from geodiff_plugin._checks import bad_value, refuse
-from geodiff_plugin.formats.depth import disparity_of_depth
-from geodiff_plugin.formats.files import read_npy
-from geodiff_plugin.formats.out import REPORT, check_new_file, write_text
+from geodiff_plugin._internal.checks import bad_value, raise_input_error
+from geodiff_plugin.formats import REPORT, check_new_file, disparity_of_depth, read_npy, write_text
 from geodiff_plugin.jobs.report import read_report
 
-#: Benchmarks by name, and where their files lie below the folder of a submission.
+#: File layout of the submission to each benchmark.
 BENCHMARKS = {
     "middlebury": "SET/SCENE/disp0METHOD.pfm (disp0METHOD_s.pfm with holes), timeMETHOD.txt",
     "eth3d": "low_res_two_view/SCENE.pfm, SCENE.txt",
@@ -25,7 +23,7 @@ BENCHMARKS = {
 
 
 def _map(path: Path) -> np.ndarray:
-    """The map of a frame, left in its file: those of a long video exceed the memory."""
+    """Return the map of a frame, memory-mapped, because the maps of a long video exceed the memory."""
     file = formats.check_file(path, "FRAME", "a folder of geodiff depth or a .npy")
     expected = "a depth map (H, W) of floats in metres"
     depth_m = read_npy(file, "FRAME", expected)
@@ -43,17 +41,17 @@ def write_video(
     far: float | None = None,
     overwrite: bool = False,
 ) -> float:
-    """Join depth maps of a sequence into a video; how many seconds it lasts.
+    """Join depth maps of a sequence into a video; return its duration in seconds.
 
-    The legend is in metres unless a report says that its map has none.
+    The legend is in metres unless a report states that its map has no unit.
 
     Args:
-        frames: folders of ``geodiff depth``, or ``.npy`` maps ``(H, W)`` in metres, all of one size.
+        frames: folders of ``geodiff depth``, or ``.npy`` maps ``(H, W)`` in metres, all of the same size.
         out: ``.mp4``, ``.webp`` or ``.gif``.
-        fps: frames a second.
-        near: depth of the last colour, metres; by default the maps' own.
-        far: depth of the first colour.
-        overwrite: whether a file of that name is replaced.
+        fps: frames per second.
+        near: depth of the last colour, metres (default: from the maps).
+        far: depth of the first colour (default: from the maps).
+        overwrite: whether to replace an existing file.
     """
     plotting.check_video(out, fps)
     check_new_file(out, overwrite)
@@ -63,16 +61,16 @@ def write_video(
     for path, size in zip(frames, sizes, strict=True):
         if size != sizes[0]:
             both = f"{sizes[0]} in {frames[0]}, {size} in {path}"
-            refuse(f"The frames have different sizes: {both}. Make a video of each size.")
+            raise_input_error(f"The frames have different sizes: {both}. Make a separate video per size.")
     metric = all(read_report(file.parent).get("unit", "m") is not None for file in files)
-    pictures = plotting.depth_frames(depths_m, near=near, far=far, unit="m" if metric else None)
-    plotting.write_depth_video(out, pictures, fps)
+    images = plotting.depth_frames(depths_m, near=near, far=far, unit="m" if metric else None)
+    plotting.write_depth_video(out, images, fps)
     return len(frames) / fps
 
 
 @dataclass(frozen=True)
 class _Submitted:
-    """One result for a benchmark: its scene's folder, disparities ``(H, W)`` in pixels, and seconds."""
+    """One benchmark result: folder of its scene, disparities ``(H, W)`` in pixels, and seconds."""
 
     scene: Path
     disparity: np.ndarray
@@ -80,10 +78,10 @@ class _Submitted:
 
 
 def write_submission(results: Sequence[Path], to: str, out: Path, method: str = "GeoDiff") -> int:
-    """Write a disparity map and a time for every result below these folders; how many there are.
+    """Write a disparity map and runtime for every result in these folders; return their number.
 
-    The folder of the left image names the scene. ``to`` is a key of ``BENCHMARKS``, ``method`` the name that
-    Middlebury's files bear.
+    The folder of the left image is the scene. ``to`` is a key of ``BENCHMARKS``, ``method`` the method name
+    in Middlebury's file names.
 
     Source: upload-format.html of Middlebury's evaluation 3; "Result submission" in ETH3D's documentation.
     """
@@ -91,14 +89,14 @@ def write_submission(results: Sequence[Path], to: str, out: Path, method: str = 
         bad_value("--method", "letters and digits", repr(method))
     folders = [path.parent for folder in results for path in sorted(folder.glob(f"**/{REPORT}"))]
     if not folders:
-        refuse(f"No result of geodiff depth lies in {', '.join(map(str, results))}.")
+        raise_input_error(f"No result of geodiff depth found in {', '.join(map(str, results))}.")
     reports = [_report(folder) for folder in folders]
     of_scene: dict[Path, Path] = {}
     for folder, report in zip(folders, reports, strict=True):
         other = of_scene.setdefault(_scene_of(report), folder)
         if other is not folder:
-            cure = "A scene is the folder of its left image: give one result of each."
-            refuse(f"{other} and {folder} are both of the scene {_scene_of(report)}. {cure}")
+            hint = "The scene is the folder of the left image; pass one result per scene."
+            raise_input_error(f"{other} and {folder} are both results of scene {_scene_of(report)}. {hint}")
     for folder, report in zip(folders, reports, strict=True):
         result = _submitted(folder, report)
         if to == "middlebury":
@@ -113,7 +111,7 @@ def write_submission(results: Sequence[Path], to: str, out: Path, method: str = 
 def _report(folder: Path) -> dict[str, Any]:
     report = read_report(folder)
     if "inputs" not in report:
-        refuse(f"{folder / REPORT} is no report of geodiff depth.")
+        raise_input_error(f"{folder / REPORT} is not a report of geodiff depth.")
     return report
 
 

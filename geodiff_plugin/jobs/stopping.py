@@ -1,4 +1,4 @@
-"""A process that is asked to end (SIGTERM) ends as by Ctrl-C: what it began is cleared away."""
+"""Makes SIGTERM end a process like Ctrl-C, with cleanup."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from geodiff_plugin._signals import stop
+from geodiff_plugin._internal.signals import stop
 
 
 class Terminated(KeyboardInterrupt):
-    """The process was asked to end by SIGTERM."""
+    """Raised when the process receives SIGTERM."""
 
 
 def _end(*_: Any) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # asked again it goes on clearing away
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # further signals do not interrupt the cleanup
     stop(Terminated)
 
 
@@ -26,9 +26,9 @@ def _interrupt(*_: Any) -> None:
 
 @contextmanager
 def ending_on_sigterm() -> Iterator[None]:
-    """Raise ``Terminated`` inside the block on SIGTERM; that, and Ctrl-C, when no ``undisturbed`` is left.
+    """Raise ``Terminated`` inside the block on SIGTERM; raise it and Ctrl-C after the last ``defer_signals``.
 
-    In a thread nothing changes, nor where Ctrl-C does something else than Python's own.
+    Does nothing in a thread, or if Ctrl-C has a handler other than Python's.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""The folder of a result: maps, pictures, clouds, exports and the report."""
+"""Writes the folder of a result: maps, images, point clouds, exports and the report."""
 
 from __future__ import annotations
 
@@ -9,45 +9,44 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin import formats, plotting
-from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
+from geodiff_plugin._internal.reprojection import depth_in_camera
+from geodiff_plugin.cameras import Camera, PosedCamera
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.formats.clouds import in_8_bits
-from geodiff_plugin.formats.files import save_png
-from geodiff_plugin.formats.out import REPORT, HeldPlace, OutFolder
-from geodiff_plugin.formats.target import read_target_camera
+from geodiff_plugin.formats import REPORT, HeldFolder, OutFolder, in_8_bits, read_target_camera, save_png
 from geodiff_plugin.jobs.finished import Row, row_of
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import DepthOptions, unique_names
-from geodiff_plugin.jobs.reading import PairInputs
-from geodiff_plugin.jobs.records import PairResult, PairRun
+from geodiff_plugin.jobs.records import PairInputs, PairResult, PairRun
 from geodiff_plugin.jobs.report import build_report, report_text, single_map, used_poses
 from geodiff_plugin.result.output import MetricDepthOutput
 
-#: Depth as the camera of ``--into`` sees it: floats, and whole millimetres.
-INTO = ("depth_into.npy", "depth_into_mm.png")
+#: Files with the depth in the camera of ``--reproject``, in metres (float) and whole millimetres.
+REPROJECTED_FILES = ("depth_reprojected.npy", "depth_reprojected_mm.png")
 
 
-def write_pair(folder: OutFolder | HeldPlace, run: PairRun, **entries: Any) -> PairResult:
-    """Fill an output folder: every map, what ``--export`` asks for, and last the report.
+def write_pair(folder: OutFolder | HeldFolder, run: PairRun, max_points: int | None = None) -> PairResult:
+    """Fill an output folder: all maps, the files of ``--export``, and the report last.
 
-    ``entries`` of the report are those that only the caller knows. The folder appears whole or not at all.
+    The folder appears complete or not at all. Point clouds are subsampled to ``max_points``.
     """
     options, inputs, output = run.options, run.inputs, run.output
     height, width = inputs.left.shape[:2]
     with fitting_memory("The result", (width, height)):
-        report = build_report(run) | entries
+        report = build_report(run)
 
     def fill(place: Path) -> None:
         with run.log.stage("write"):
-            report["files"] = write_maps(place, output, inputs.left, options.min_confidence)
+            report["files"] = write_maps(
+                place, output, inputs.left, *thresholds(options), max_points=max_points
+            )
             if inputs.undistorted:
                 write_undistorted(place, inputs.left)
-            if options.into is not None:
+            if options.reproject is not None:
                 depth_m = single_map(output.prediction * output.valid)
                 K = np.asarray(output.K)[0].astype(np.float64)
-                report["into"] = write_into(place, depth_m, K, options.into)
+                report["reproject"] = write_reprojected(place, depth_m, K, options.reproject)
             if options.export:
-                write_exports(place, output, inputs, options)
+                write_exports(place, output, inputs, options, max_points)
         report["files"]["names"] = [*sorted(path.name for path in place.iterdir()), REPORT]
         report["seconds"] = {stage: round(seconds, 3) for stage, seconds in run.log.seconds.items()}
         (place / REPORT).write_text(report_text(report) + "\n", encoding="utf-8")
@@ -57,107 +56,144 @@ def write_pair(folder: OutFolder | HeldPlace, run: PairRun, **entries: Any) -> P
     return PairResult(run, folder.path, report)
 
 
-def write_row(folder: OutFolder | HeldPlace, run: PairRun, entries: dict[str, Any]) -> Row:
-    """``write_pair``, and the row of a table that says what it wrote."""
-    return row_of(write_pair(folder, run, **entries).report)
+def write_row(folder: OutFolder | HeldFolder, run: PairRun) -> Row:
+    """Call ``write_pair``, and return the table row of the result."""
+    return row_of(write_pair(folder, run).report)
+
+
+def thresholds(options: DepthOptions) -> tuple[float, float | None]:
+    """Return the thresholds of ``MetricDepthOutput.reliable`` for the points of clouds and exports."""
+    return options.min_confidence, options.max_sigma
 
 
 def write_maps(
-    folder: Path, output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0
+    folder: Path,
+    output: MetricDepthOutput,
+    left: np.ndarray,
+    min_confidence: float = 0.0,
+    max_sigma: float | None = None,
+    max_points: int | None = None,
 ) -> dict[str, Any]:
-    """Write every file but exports and the report of the image ``left (H, W, 3)``; counts for the report."""
+    """Write all files of the image ``left (H, W, 3)`` except exports and report; return report counts.
+
+    The cloud has the points that are ``reliable`` under the thresholds.
+    """
     depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
     formats.write_depth_npy(folder / "depth.npy", depth_m)
     valid = single_map(output.valid)
     zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m * valid)
     depth = _save_figure(plotting.depth_figure(depth_m, unit=output.unit), folder / "depth.png")
     maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
-    of_call = {name: getattr(output, name) for name in ("photometric_error", "uncertainty", "confidence")}
-    maps |= {name: single_map(value) for name, value in of_call.items() if value is not None}
+    names = ("photometric_error", "uncertainty", "confidence", "sigma")
+    maps |= {name: single_map(x) for name in names if (x := getattr(output, name)) is not None}
+    sigma_m = maps.get("sigma")
+    if sigma_m is not None:
+        formats.write_sigma_mm(folder / "sigma_mm.png", sigma_m)
     for name, values in maps.items():
         np.save(folder / f"{name}.npy", values.astype(np.float32))
-    flying, doubtful = formats.flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool)
+    flying, reliable = formats.flying_points(depth_m), single_map(output.reliable(min_confidence, max_sigma))
     confidence = error = None
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
         save_png(Image.fromarray(visible.astype(np.uint8) * 255), folder / "visible.png")
         error = np.where(visible, maps["photometric_error"], np.nan)
     if output.confidence is not None:
-        figure = plotting.share_figure(maps["confidence"], "confidence", 1.0)
+        figure = plotting.fraction_figure(maps["confidence"], "confidence", 1.0)
         confidence = _save_figure(figure, folder / "confidence.png")
-        doubtful = maps["confidence"] < min_confidence
     left = in_8_bits(left)
     save_png(plotting.overview(left, depth, confidence, error), folder / "overview.png")
-    kept = valid & ~(flying | doubtful)
-    points = formats.write_ply(folder / "cloud.ply", depth_m, left, K, valid=kept, unit=output.unit)
+    kept, cloud = _thinned(reliable & ~flying, max_points), folder / "cloud.ply"
+    points = formats.write_ply(cloud, depth_m, left, K, valid=kept, unit=output.unit, sigma_m=sigma_m)
     return {
         "depth_mm_zero_pixels": zeros,
         "cloud_points": points,
         "flying_points": int(flying.sum()),
-        "doubtful_points": int(doubtful.sum()),
+        "doubtful_points": int((valid & ~reliable).sum()),
         "points_out_of_reach": int((~valid).sum()),
     }
 
 
+def _thinned(kept: np.ndarray, max_points: int | None) -> np.ndarray:
+    """Return at most ``max_points`` of the pixels of a mask, evenly subsampled in pixel order."""
+    pixels = np.flatnonzero(kept)
+    if max_points is None or len(pixels) <= max_points:
+        return kept
+    thinned = np.zeros(kept.shape, dtype=bool)
+    thinned.flat[pixels[np.linspace(0, len(pixels) - 1, max_points).astype(np.intp)]] = True
+    return thinned
+
+
 def _save_figure(figure: Image.Image, path: Path) -> Image.Image:
-    """Save a figure; what the overview shows of it, as it may be large."""
+    """Save a figure; return a smaller copy for the overview."""
     save_png(figure, path)
     return plotting.shrunk(figure)
 
 
-def write_into(folder: Path, depth_m: np.ndarray, K: np.ndarray, path: Path) -> dict[str, Any]:
-    """Write a depth map ``(H, W)`` as the camera of ``--into`` sees it; what the report says of it."""
+def write_reprojected(folder: Path, depth_m: np.ndarray, K: np.ndarray, path: Path) -> dict[str, Any]:
+    """Write a depth map ``(H, W)`` in the camera of ``--reproject``; return its report entry."""
     camera = read_target_camera(path)
-    seen_m = depth_in_camera(depth_m, K, camera)
-    formats.write_depth_npy(folder / INTO[0], seen_m)
-    formats.write_depth_mm(folder / INTO[1], seen_m)
+    seen_m = depth_in_camera(depth_m, Camera(K), camera)
+    formats.write_depth_npy(folder / REPROJECTED_FILES[0], seen_m)
+    formats.write_depth_mm(folder / REPROJECTED_FILES[1], seen_m)
     known = round(float((seen_m > 0).mean()), 4)
-    return {"K": camera.K.tolist(), "E": camera.E.tolist(), "size": list(camera.size), "known_share": known}
+    return {
+        "K": camera.K.tolist(),
+        "E": camera.E.tolist(),
+        "size": list(camera.size),
+        "known_fraction": known,
+    }
 
 
 def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> str:
-    """Write a view without its lens distortion, 1 for the left one, to which the depth belongs; its name."""
+    """Write an undistorted view (1 is the left one, to which the depth refers); return the file name."""
     name = "undistorted.png" if number == 1 else f"undistorted-{number}.png"
-    save_png(plotting.as_picture(image_01), folder / name)
+    save_png(plotting.as_rgb_image(image_01), folder / name)
     return name
 
 
 def cameras_of(output: MetricDepthOutput, guidance: GeometryGuidance) -> tuple[PosedCamera, ...]:
-    """The camera of every view of one image, left one first; poses as the call used them."""
+    """Return the camera of every view of one image, left one first, with the poses used by the call."""
     depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
     further = zip(guidance.rigs, used_poses(output, guidance), guidance.rights, strict=True)
-    rights = (PosedCamera(rig.K_right, E, (image.shape[-1], image.shape[-2])) for rig, E, image in further)
-    return (PosedCamera(K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
+    rights = (PosedCamera(rig.K_right, (image.shape[-1], image.shape[-2]), E=E) for rig, E, image in further)
+    return (PosedCamera(K, (depth_m.shape[1], depth_m.shape[0]), E=np.eye(4)), *rights)
 
 
 class ShownPixels(NamedTuple):
-    """What ``make_cloud`` and ``make_mesh`` take."""
+    """Arguments of ``make_cloud`` and ``make_mesh``."""
 
     depth_m: np.ndarray  # (H, W)
     image_01: np.ndarray  # (H, W, 3)
     K: np.ndarray  # (3, 3)
-    valid: np.ndarray  # (H, W) bool, the pixels to be shown
+    valid: np.ndarray  # (H, W) bool
 
 
-def pixels_of(output: MetricDepthOutput, left: np.ndarray, least_confidence: float) -> ShownPixels:
-    """The pixels of a result that a cloud shows: valid ones of this confidence or more that do not fly."""
+def pixels_of(
+    output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0, max_sigma: float | None = None
+) -> ShownPixels:
+    """Return the pixels of a point cloud: reliable under the thresholds, and no flying pixels."""
     depth_m = single_map(output.prediction)
-    keep = single_map(output.valid) & ~formats.flying_points(depth_m)
-    if output.confidence is not None:
-        keep &= single_map(output.confidence) >= least_confidence
+    keep = single_map(output.reliable(min_confidence, max_sigma)) & ~formats.flying_points(depth_m)
     return ShownPixels(depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep)
 
 
-def write_exports(folder: Path, output: MetricDepthOutput, inputs: PairInputs, options: DepthOptions) -> None:
-    """Write what ``--export`` asks for, and images of a COLMAP model that were undistorted."""
-    pixels = pixels_of(output, inputs.left, options.min_confidence)
-    cameras = cameras_of(output, inputs.guidance)
+def write_exports(
+    folder: Path,
+    output: MetricDepthOutput,
+    inputs: PairInputs,
+    options: DepthOptions,
+    max_points: int | None = None,
+) -> None:
+    """Write the files of ``--export``, and the undistorted images of a COLMAP model."""
+    pixels = pixels_of(output, inputs.left, *thresholds(options))
+    cameras = [(camera.K, camera.E, camera.size) for camera in cameras_of(output, inputs.guidance)]
     if "glb" in options.export:
-        formats.write_glb(folder / "cloud.glb", formats.make_cloud(*pixels), cameras)
+        cloud = formats.make_cloud(*pixels._replace(valid=_thinned(pixels.valid, max_points)))
+        formats.write_glb(folder / "cloud.glb", cloud, cameras)
     if "mesh" in options.export:
         formats.write_glb(folder / "mesh.glb", formats.make_mesh(*pixels), cameras)
     if "colmap" in options.export:
-        names = unique_names(options.photographs().values())
+        names = unique_names(options.image_files().values())
         if inputs.undistorted:
             views = [inputs.left, *(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)]
             names = [write_undistorted(folder, image, number) for number, image in enumerate(views, 1)]

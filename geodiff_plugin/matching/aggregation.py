@@ -1,4 +1,4 @@
-"""Semi-global aggregation: neighbours vote for similar inverse depths along straight paths.
+"""Semi-global aggregation: smooths matching costs along straight paths.
 
 Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual information", Eq. 13.
 """
@@ -10,48 +10,27 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from geodiff_plugin._kernels import use_kernel
+from geodiff_plugin._internal.kernels import has_kernel
 from geodiff_plugin.matching.census import COST_LEVELS
-from geodiff_plugin.matching.winner import NEVER
-
-#: Cost of a step of one plane between neighbouring pixels, in units of the largest matching cost.
-STEP_PENALTY = 0.15
-#: Cost of any larger step where the image is flat.
-JUMP_PENALTY = 1.2
-#: Difference in brightness that halves this cost: depth steps where the image does.
-JUMP_CONTRAST = 0.1
-#: Steps (rows, columns) along which paths run both ways: down and up, right and left.
-AXES = ((1, 0), (0, 1))
-PATHS = 2 * len(AXES)
-
-
-def empty_volume(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Uninitialised ``(planes, N, M)`` for ``size = (N, M)``, laid out for paths from row to row."""
-    return torch.empty(size[0], planes, size[1], dtype=dtype, device=device).transpose(0, 1)
-
-
-class Buffers:
-    """Buffers reused from one aggregation to the next: touching fresh memory costs as much as a path."""
-
-    def __init__(self) -> None:
-        self._held: dict[str, Tensor] = {}
-
-    def empty(self, name: str, planes: int, size: tuple[int, int], like: Tensor) -> Tensor:
-        """``empty_volume`` in the buffer of this name, whose former content is lost."""
-        count, held = planes * size[0] * size[1], self._held.get(name)
-        if held is None or held.numel() < count:
-            held = self._held[name] = torch.empty(count, dtype=like.dtype, device=like.device)
-        return held[:count].view(size[0], planes, size[1]).transpose(0, 1)
+from geodiff_plugin.matching.constants import (
+    AXES,
+    JUMP_CONTRAST,
+    JUMP_PENALTY,
+    NEVER,
+    STEP_LEVELS,
+    STEP_PENALTY,
+)
+from geodiff_plugin.matching.volume import Buffers
 
 
 def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor, *, fresh: bool) -> None:
-    """Add the path from the first row down and that from the last row up to ``total (D, N, M)`` int16.
+    """Add the downward path from the first row and the upward one from the last to ``total (D, N, M)`` int16.
 
-    ``cost (D, N, M)`` uint8; ``p1`` is the penalty of a step of one plane, ``p2 (N, M)`` int16 that of any
-    larger one between row n - 1 and row n. A ``fresh`` total has no content yet.
+    ``cost (D, N, M)`` is uint8. ``p1`` is the penalty of a step of one plane, ``p2 (N, M)`` int16 the penalty
+    of any larger step between rows n - 1 and n. With ``fresh`` the content of ``total`` is undefined.
     """
     planes, count, breadth = cost.shape
-    # Both directions advance together, entry 0 down and entry 1 up; the padding at both ends never wins.
+    # Both directions advance together: entry 0 down, entry 1 up. The padded planes at both ends never win.
     padded = total.new_full((2, planes + 2, breadth), NEVER)
     path, before, after = padded[:, 1:-1], padded[:, :-2], padded[:, 2:]
     step, least = total.new_empty(2, planes, breadth), total.new_empty(2, 1, breadth)
@@ -66,7 +45,7 @@ def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor, *, fresh: bool)
         for i, row in enumerate(rows):
             if fresh and 2 * n < count:
                 total[:, row].zero_()
-            path[i].copy_(cost[:, row])  # a sum of two types would cost more
+            path[i].copy_(cost[:, row])  # adding two dtypes would be slower
         if n:
             path.add_(step)
         for i, row in enumerate(rows):
@@ -74,15 +53,12 @@ def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor, *, fresh: bool)
 
 
 def jump_penalties(grey: Tensor, axes: Sequence[tuple[int, int]]) -> Tensor:
-    """Edge-adaptive P2 of each axis, ``(A, H, W)`` int16: jumps at edges of ``grey (H, W)`` are cheap.
+    """Compute the edge-adaptive P2 of each axis, ``(A, H, W)`` int16: low at edges of ``grey (H, W)``.
 
-    At a pixel stands the penalty between it and the one a step of the axis before it, which is the same both
-    ways. An axis is a step (rows, columns) of 0, 1 or -1 along rows and of 0 or 1 down.
+    Each pixel holds the penalty between it and the previous pixel along the axis, the same in both
+    directions. It is 0 next to NaN, an invalid pixel, so that no path continues there. An axis is a step
+    (rows, columns) with 0 or 1 rows and -1, 0 or 1 columns.
     """
-    if use_kernel(grey):
-        from geodiff_plugin.matching import kernels
-
-        return kernels.jump_penalties(grey, axes)
     difference = grey.new_zeros(len(axes), *grey.shape)
     height, width = grey.shape
     for of_axis, (down, across) in zip(difference, axes, strict=True):
@@ -90,35 +66,33 @@ def jump_penalties(grey: Tensor, axes: Sequence[tuple[int, int]]) -> Tensor:
         later, before = grey[down:, left : width - right], grey[: height - down, right : width - left]
         of_axis[down:, left : width - right] = (later - before).abs()
     limit = JUMP_PENALTY / (1.0 + difference / JUMP_CONTRAST)
-    limit = limit.clamp_min(2.0 * STEP_PENALTY)
+    limit = limit.clamp_min(2.0 * STEP_PENALTY).nan_to_num(0.0)
     return (COST_LEVELS * limit).round().to(torch.int16)
 
 
 @torch.no_grad()
+@has_kernel("matching.kernels.aggregation.aggregate")
 def aggregate(levels: Tensor, grey: Tensor, *, buffers: Buffers | None = None) -> Tensor:
-    """Sums ``(D, H, W)`` below ``NEVER`` of costs ``(D, H, W)`` uint8 along four paths.
+    """Sum costs ``(D, H, W)`` uint8 along four paths; the sums ``(D, H, W)`` are below ``NEVER``.
 
-    They are int16, from the kernel int32. A brightness edge in ``grey (H, W)``, the same view in [0, 1],
-    makes a jump in depth cheaper. The result stays in ``buffers`` until their next use.
+    Sums are int16, from the kernel int32. A brightness edge in ``grey (H, W)``, the same view in [0, 1],
+    lowers the penalty of a depth discontinuity; paths start again at NaN, an invalid pixel. The result is
+    valid until the next use of ``buffers``.
 
     Source: Hirschmueller 2008, Eq. 13.
     """
-    penalties, step = jump_penalties(grey, AXES), round(COST_LEVELS * STEP_PENALTY)
-    if use_kernel(levels):
-        from geodiff_plugin.matching import kernels
-
-        return kernels.aggregate(levels, penalties, step, AXES)
+    penalties = jump_penalties(grey, AXES)
     vertical, horizontal = penalties[0], penalties[1].T
     planes, height, width = levels.shape
     buffers, paths = buffers or Buffers(), levels.new_empty(0, dtype=torch.int16)
-    turned = buffers.empty("turned", planes, (width, height), levels)
+    transposed = buffers.empty("turned", planes, (width, height), levels)
     sideways = buffers.empty("sideways", planes, (width, height), paths)
     total = buffers.empty("total", planes, (height, width), paths)
-    # Contiguous copies plane by plane make the transposition several times as fast.
-    for plane, source in zip(turned, levels, strict=True):
+    # Making contiguous copies plane by plane speeds the transposition up several times.
+    for plane, source in zip(transposed, levels, strict=True):
         plane.copy_(source.contiguous().T.contiguous())
-    _scan_rows(turned, step, horizontal, sideways, fresh=True)
+    _scan_rows(transposed, STEP_LEVELS, horizontal, sideways, fresh=True)
     for plane, source in zip(total, sideways, strict=True):
         plane.copy_(source.contiguous().T.contiguous())
-    _scan_rows(levels, step, vertical, total, fresh=False)
+    _scan_rows(levels, STEP_LEVELS, vertical, total, fresh=False)
     return total

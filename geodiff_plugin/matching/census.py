@@ -1,4 +1,4 @@
-"""Soft census transform (Zabih and Woodfill 1994): an exposure-invariant descriptor in small integers."""
+"""Soft census transform (Zabih and Woodfill 1994): an exposure-invariant descriptor of small integers."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from torch import Tensor
 
 from geodiff_plugin.geometry import constant_like
 
-#: Half the window: the margin that an image needs around the pixels whose census is taken.
+#: Half width of the window, which is the margin that an image needs around its pixels.
 MARGIN_PX = 3
-#: Neighbours along a side of the window: every second one of 7.
+#: Neighbours along a side of the window: every second of 7.
 SIDE = 4
-# A difference of this counts as certain; a smaller one in proportion, so that noise hardly votes.
+# Brightness difference of a certain vote. Smaller ones vote in proportion, so noise has little effect.
 _CONTRAST = 6.0 / 255.0
-#: A certain vote; the largest for which a cost still fits into a byte.
+#: Value of a certain vote, the largest for which a cost fits a byte.
 VOTE_LEVELS = 7
-#: The cost of two descriptors that differ in everything: 224.
+#: Cost of two descriptors that differ in every neighbour: 224.
 COST_LEVELS = 2 * VOTE_LEVELS * SIDE * SIDE
-#: Levels of ``grey_levels`` from black to white.
+#: Number of ``grey_levels`` from black to white.
 GREY_LEVELS = VOTE_LEVELS / _CONTRAST
 # Weights of red, green and blue (ITU-R BT.601).
 _LUMA = 0.299, 0.587, 0.114
 
 
 def grey(image_01: Tensor) -> Tensor:
-    """Luma ``(..., 1, H, W)`` float32 in [0, 1] of images ``(..., 3, H, W)``, or of what is grey already."""
+    """Convert images ``(..., 3, H, W)`` to luma ``(..., 1, H, W)`` float32 in [0, 1]; grey ones are kept."""
     image_01 = image_01.float()
     if image_01.shape[-3] == 1:
         return image_01
@@ -32,18 +32,18 @@ def grey(image_01: Tensor) -> Tensor:
 
 
 def grey_levels(grey_01: Tensor) -> Tensor:
-    """Grey in [0, 1] as int16 levels, of which ``VOTE_LEVELS`` count as a certain difference.
+    """Convert grey in [0, 1] to int16 levels, of which ``VOTE_LEVELS`` are a certain difference.
 
-    About 1.2 of them are an 8-bit level.
+    An 8-bit level is about 1.2 of them.
     """
     return (grey_01 * GREY_LEVELS).round().to(torch.int16)
 
 
 def census(levels: Tensor, out: Tensor | None = None) -> Tensor:
-    """How the 16 neighbours of every pixel compare with it, ``(16, H, W)`` int16 up to ``VOTE_LEVELS``.
+    """Compare the 16 neighbours of every pixel with it: ``(16, H, W)`` int16 in +-``VOTE_LEVELS``.
 
-    ``levels (H + 6, W + 6)``, contiguous, of ``grey_levels``, have a margin of ``MARGIN_PX`` all around. The
-    result is unchanged by an offset in brightness, nearly so by a gain; it is written to ``out``.
+    ``levels (H + 6, W + 6)``, contiguous, from ``grey_levels``, have a margin of ``MARGIN_PX`` on all sides.
+    The result is invariant to a brightness offset and nearly so to a gain. It is written to ``out``.
     """
     height, width = (side - 2 * MARGIN_PX for side in levels.shape)
     stride = levels.shape[1]
@@ -56,12 +56,12 @@ def census(levels: Tensor, out: Tensor | None = None) -> Tensor:
 
 
 def census_cost(left: Tensor, right: Tensor, out: Tensor | None = None) -> Tensor:
-    """Difference ``(H, W)`` uint8, 0 to ``COST_LEVELS``, between two results ``(16, H, W)`` of ``census``.
+    """Compute the difference ``(H, W)`` uint8, 0 to ``COST_LEVELS``, of two ``census`` ``(16, H, W)``.
 
-    Both are int8 or int16. About 0.35 of the largest for unrelated natural texture, 0.5 for noise. ``out``,
-    of the same shape and type, is worked in; it may be ``left``.
+    Both are int8 or int16. Unrelated natural texture gives about 0.35 of the maximum, noise 0.5. ``out``, of
+    the same shape and dtype, is a work buffer; it may be ``left``.
     """
-    apart = torch.sub(left, right, out=out).abs_()
-    if apart.dtype == torch.int8:
-        return apart.view(torch.uint8).sum(dim=0, dtype=torch.uint8)
-    return apart.sum(dim=0, dtype=torch.int16).to(torch.uint8)
+    difference = torch.sub(left, right, out=out).abs_()
+    if difference.dtype == torch.int8:
+        return difference.view(torch.uint8).sum(dim=0, dtype=torch.uint8)
+    return difference.sum(dim=0, dtype=torch.int16).to(torch.uint8)

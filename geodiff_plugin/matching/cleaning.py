@@ -1,7 +1,7 @@
-"""Removal of JPEG blocks and sensor noise from photographs before they are compared.
+"""Removes JPEG blocks and sensor noise from images before they are matched.
 
 The filter is hard thresholding of a shifted 8 x 8 DCT (Coifman and Donoho 1995, "Translation-invariant
-de-noising"); the quantisation table is K.1 of ITU-T T.81.
+de-noising"). The quantisation table is K.1 of ITU-T T.81.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._kernels import launch_bound
+from geodiff_plugin._internal.kernels import launch_bound
 from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching.census import grey
 
@@ -32,46 +32,47 @@ _LUMA_STEPS = (
     *(49, 64, 78, 87, 103, 121, 120, 101),
     *(72, 92, 95, 98, 112, 100, 103, 99),
 )
-# Coefficients that even strong compression keeps.
+# Coefficients that are kept even by strong compression.
 _KEPT = ((0, 1), (1, 0), (2, 0), (1, 1), (0, 2), (0, 3), (1, 2), (2, 1), (3, 0))
-# How many of them must agree on the scale of the table.
-_LEAST_VOTES = 5
-# How nearly they must agree.
-_ALIKE = 0.3
-# Upper bound on the quantisation steps that are tried.
-_MOST_STEP = 100
-# Upper bound on the blocks that are read, which bounds the time.
-_MOST_BLOCKS = 2048
-# A step counts if at least so many values are multiples of it.
-_LEAST_VALUES = 32
-# How closely they must be multiples of it (mean cosine).
-_LEAST_FIT = 0.5
-# A step of more grey levels than this between two pixels is the scene's, not the edge of a block.
-_MOST_BLOCK_EDGE = 8.0
-# Noise is read from the finest coefficients of the flattest blocks, of which this is the share.
+# Minimum number of these coefficients that agree on the scale of the table.
+_MIN_AGREEING = 5
+# Relative tolerance of this agreement.
+_TOLERANCE = 0.3
+# Maximum quantisation step that is tried.
+_MAX_STEP = 100
+# Maximum number of blocks that are read, which bounds the time.
+_MAX_BLOCKS = 2048
+# Minimum number of values that are multiples of a step.
+_MIN_VALUES = 32
+# Minimum mean cosine of the values as multiples of a step.
+_MIN_COSINE = 0.5
+# Largest step between two pixels, grey levels, that can be a block edge rather than scene content.
+_MAX_BLOCK_EDGE = 8.0
+# Fraction of blocks, the flattest ones, whose finest coefficients measure the noise.
 _FLATTEST = 0.1
-# The finest coefficients.
+# The finest coefficients of a block.
 _FINE = tuple((i, j) for i in range(_BLOCK // 2, _BLOCK) for j in range(_BLOCK // 2, _BLOCK))
-# These contain less of it than the others: the factor is that of normally distributed noise.
+# Correction factor for selecting the flattest blocks, for normally distributed noise.
 _NOISE_OF_FLATTEST = 1.0 / 0.77
-# Noise below the first number of grey levels does not disturb the matching and may be fine texture; noise
-# above the second is removed in full.
+# Noise below the first number of grey levels does not affect matching and may be fine texture; noise above
+# the second is removed completely.
 _NOISE_RANGE = (1.7, 2.8)
-# Coefficients below this number of steps are removed. On rendered pairs wrong matches are equally few from
-# half to twice this number.
+# Threshold of the coefficients, in quantisation steps. On rendered pairs the number of wrong matches is
+# equally low from half to twice this value.
 _STEPS = 1.2
-# So are those below this number of noise deviations; the same holds of it.
+# Threshold of the coefficients, in noise standard deviations; equally insensitive between half and twice this
+# value.
 _DEVIATIONS = 3.6
-# 16 of the 64 positions of the blocks, every row and column twice.
+# 16 of the 64 block offsets, with every row and column twice.
 _SHIFTS = tuple((i, (3 * i + k) % _BLOCK) for i in range(_BLOCK) for k in (0, _BLOCK // 2))
-# A picture with more than so many times the pixels of the matching grid is cleaned enough by shrinking;
-# 1280 x 960 still gains from cleaning.
-_SHRUNK = 6.0
+# An image with more than this many times the pixels of the matching grid is cleaned enough by downscaling;
+# 1280 x 960 still benefits from cleaning.
+_MAX_PIXEL_RATIO = 6.0
 
 
 @cache
 def _basis() -> np.ndarray:
-    """Orthonormal DCT-II, ``(frequency, pixel)``."""
+    """Return the orthonormal DCT-II basis, ``(frequency, pixel)``."""
     n = np.arange(_BLOCK)
     waves = np.cos(math.pi * (2 * n[None] + 1) * n[:, None] / (2 * _BLOCK)) * math.sqrt(2 / _BLOCK)
     waves[0] /= math.sqrt(2)
@@ -80,24 +81,24 @@ def _basis() -> np.ndarray:
 
 @cache
 def _coefficients(places: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """What the 64 pixels of a block are multiplied by for coefficients at (row, column), ``(64, n)``."""
+    """Return the weights ``(64, n)`` of a block's pixels for the coefficients at (row, column)."""
     waves = [np.outer(_basis()[row], _basis()[column]).ravel() for row, column in places]
     return np.stack(waves, axis=1).astype(np.float32)
 
 
 def _transformed(blocks: Tensor, basis: Tensor) -> Tensor:
-    """``basis @ block @ basis.T`` of every block of ``(h, 8, w, 8)``, as few large products."""
+    """Compute ``basis @ block @ basis.T`` of every block of ``(h, 8, w, 8)``, as a few large products."""
     return (basis @ (blocks.reshape(-1, _BLOCK) @ basis.T).view(len(blocks), _BLOCK, -1)).view(blocks.shape)
 
 
 def _steps_at_edges(levels: Tensor, axis: int) -> Tensor:
-    """Mean step from a pixel to the one below (axis 0) or beside it (1), by place modulo 8, ``(N, 8)``."""
-    steps = levels.diff(dim=axis + 1).abs().clamp_max(_MOST_BLOCK_EDGE).mean(2 - axis)
+    """Average the step to the pixel below (axis 0) or to the right (1), by position modulo 8, ``(N, 8)``."""
+    steps = levels.diff(dim=axis + 1).abs().clamp_max(_MAX_BLOCK_EDGE).mean(2 - axis)
     return steps[:, : steps.shape[1] // _BLOCK * _BLOCK].view(len(levels), -1, _BLOCK).mean(1)
 
 
 def _noise_energy(levels: Tensor) -> Tensor:
-    """``(N, 1)`` energy of the finest coefficients of the flattest blocks."""
+    """Compute the energy ``(N, 1)`` of the finest coefficients of the flattest blocks."""
     rows, columns = (side // _BLOCK for side in levels.shape[1:])
     whole = levels[:, : rows * _BLOCK, : columns * _BLOCK].reshape(-1, rows, _BLOCK, columns, _BLOCK)
     blocks = whole.transpose(2, 3).reshape(len(levels), rows * columns, -1)
@@ -109,20 +110,21 @@ def _noise_energy(levels: Tensor) -> Tensor:
 
 
 class Flaws(NamedTuple):
-    """What is wrong with a photograph."""
+    """Compression and noise of an image."""
 
-    jpeg_scale: float  # steps of its quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at 80
+    jpeg_scale: float  # quantisation steps as a multiple of table K.1: 1 at quality 50, .4 at 80
     noise: float  # standard deviation, levels of 255
 
 
 def find_flaws(levels: Tensor) -> list[Flaws]:
-    """How coarsely photographs ``(N, H, W)``, grey levels up to 255, were compressed, and how noisy they are.
+    """Measure compression and noise of images ``(N, H, W)``, grey levels up to 255.
 
-    The scale is 0 where no trace of compression remains, as after resampling. A device is waited for twice.
+    The scale is 0 if no trace of compression remains, as after resampling. Synchronizes with the device
+    twice.
     """
     found = torch.cat([*(_steps_at_edges(levels, axis) for axis in (0, 1)), _noise_energy(levels)], dim=1)
     numbers = found.cpu().numpy()
-    # Where the blocks begin, 0 to 7: a crop begins within one.
+    # Offset of the block grid, 0 to 7, which depends on how the image was cropped.
     begins = [(numbers[:, at : at + _BLOCK].argmax(1) + 1) % _BLOCK for at in (0, _BLOCK)]
     scales = _jpeg_scales(levels, np.stack(begins, axis=1))
     noises = np.sqrt(numbers[:, -1]) * _NOISE_OF_FLATTEST
@@ -130,26 +132,26 @@ def find_flaws(levels: Tensor) -> list[Flaws]:
 
 
 def _jpeg_scales(levels: Tensor, begins: np.ndarray) -> list[float]:
-    """``Flaws.jpeg_scale`` of every picture, whose blocks begin at ``begins (N, 2)``, row and column.
+    """Return ``Flaws.jpeg_scale`` of every image, with blocks offset by ``begins (N, 2)``, row and column.
 
-    Of each of some coefficients the largest step is sought of which its values are multiples.
+    For each of some coefficients the largest step is chosen of which its values are multiples.
     """
     blocks = _some_blocks(levels, begins)
     value = (blocks @ to_device_of(levels, _coefficients(_KEPT))).abs()[..., None]  # (N, n, kept, 1)
-    step = np.arange(2, _MOST_STEP, dtype=np.float32)
+    step = np.arange(2, _MAX_STEP, dtype=np.float32)
     least, waves = to_device_of(levels, np.stack([0.6 * step, 2 * math.pi / step]).astype(np.float32))
-    counts = value > least  # 0 is a multiple of everything
+    counts = value > least  # 0 is a multiple of every step
     sums = torch.stack([counts.sum(1), (value * waves).cos_().mul_(counts).sum(1)])  # (2, N, kept, steps)
     number, fit = sums.cpu().numpy()
-    multiple = (fit > _LEAST_FIT * number.clip(1)) & (number >= _LEAST_VALUES)
+    multiple = (fit > _MIN_COSINE * number.clip(1)) & (number >= _MIN_VALUES)
     largest = (step * multiple).max(-1)
     return [_scale(of_image) for of_image in largest / [_LUMA_STEPS[_BLOCK * i + j] for i, j in _KEPT]]
 
 
 def _some_blocks(levels: Tensor, begins: np.ndarray) -> Tensor:
-    """Pixels ``(N, n, 64)`` of at most ``_MOST_BLOCKS`` blocks; 0 where a picture has fewer than others."""
+    """Return the pixels ``(N, n, 64)`` of at most ``_MAX_BLOCKS`` blocks; 0 if an image has fewer."""
     rows, columns = ((np.array(levels.shape[1:]) - begins) // _BLOCK).T[..., None]
-    every = np.maximum(1, -(-rows * columns // _MOST_BLOCKS))
+    every = np.maximum(1, -(-rows * columns // _MAX_BLOCKS))
     block = np.arange((-(-rows * columns // every)).max()) * every
     exists = block < rows * columns
     row, column = (begins[:, axis, None] + _BLOCK * at for axis, at in enumerate(np.divmod(block, columns)))
@@ -161,42 +163,42 @@ def _some_blocks(levels: Tensor, begins: np.ndarray) -> Tensor:
 
 
 def _scale(scales: np.ndarray) -> float:
-    """The scale of the table that the coefficients agree on; 0 if too few do."""
+    """Return the scale of the table that the coefficients agree on; 0 if too few agree."""
     found = np.sort(scales[scales > 0])
-    if len(found) < _LEAST_VOTES:
+    if len(found) < _MIN_AGREEING:
         return 0.0
     middle = float(found[(len(found) - 1) // 2])
-    return middle if (np.abs(found / middle - 1.0) < _ALIKE).sum() >= _LEAST_VOTES else 0.0
+    return middle if (np.abs(found / middle - 1.0) < _TOLERANCE).sum() >= _MIN_AGREEING else 0.0
 
 
 def _threshold(flaws: Flaws) -> np.ndarray | None:
-    """Size ``(8, 8)`` below which coefficients are removed; ``None`` where nothing is to be removed."""
+    """Return the threshold ``(8, 8)`` of coefficients; ``None`` if nothing is to be removed."""
     low, high = _NOISE_RANGE
     noise = flaws.noise * min(max((flaws.noise - low) / (high - low), 0.0), 1.0)
     if not flaws.jpeg_scale and not noise:
         return None
     table = np.array(_LUMA_STEPS).reshape(_BLOCK, _BLOCK)
     threshold = np.hypot(_STEPS * flaws.jpeg_scale * table, _DEVIATIONS * noise)
-    threshold[0, 0] = 0.0  # the mean of a block is always kept
+    threshold[0, 0] = 0.0  # always keep the mean of a block
     return threshold.astype(np.float32)
 
 
 @torch.no_grad()
 def clean(images: Sequence[Tensor], grid_pixels: int) -> list[Tensor]:
-    """Photographs ``(3, H, W)``, or grey, without the blocks of their compression and sensor noise.
+    """Remove compression blocks and sensor noise from images ``(3, H, W)``, or grey ones.
 
-    Blocks stand at the same columns of both images, so that faint texture matches at shifts of 8 pixels;
-    noise hides it. What is not flawed, or has more than six times ``grid_pixels``, those of the grid that it
-    is compared on, is returned as it is. Flaws of images of one size are looked for together.
+    Block edges are at the same columns of both images, so that weak texture would match at shifts of 8
+    pixels; noise hides it. Images without flaws, or with more than six times ``grid_pixels``, the pixels of
+    the matching grid, are returned unchanged. Images of one size are analysed together.
     """
     cleaned = list(images)
-    most, by_shape = _SHRUNK * grid_pixels, defaultdict[torch.Size, list[int]](list)
+    most, by_shape = _MAX_PIXEL_RATIO * grid_pixels, defaultdict[torch.Size, list[int]](list)
     for number, image in enumerate(images):
         if image.shape[-2] * image.shape[-1] <= most:
             by_shape[image.shape].append(number)
-    for alike in by_shape.values():
-        levels = grey(torch.stack([images[number] for number in alike]))[:, 0] * 255.0
-        for number, of_image, flaws in zip(alike, levels, find_flaws(levels), strict=True):
+    for of_size in by_shape.values():
+        levels = grey(torch.stack([images[number] for number in of_size]))[:, 0] * 255.0
+        for number, of_image, flaws in zip(of_size, levels, find_flaws(levels), strict=True):
             threshold = _threshold(flaws)
             if threshold is not None:
                 change = (_without(of_image, threshold) - of_image) / 255.0
@@ -205,12 +207,14 @@ def clean(images: Sequence[Tensor], grid_pixels: int) -> list[Tensor]:
 
 
 def _without(levels: Tensor, threshold: np.ndarray) -> Tensor:
-    """Grey levels ``(H, W)`` without coefficients below a ``threshold (8, 8)``, the mean of all shifts."""
+    """Remove coefficients below ``threshold (8, 8)`` from grey levels ``(H, W)``, averaged over offsets."""
     basis, least = (to_device_of(levels, each.astype(np.float32)) for each in (_basis(), threshold))
-    tall, broad = (side + (-side) % _BLOCK + _BLOCK for side in levels.shape)  # whole blocks, and one more
-    sides = _BLOCK, broad - levels.shape[1], _BLOCK, tall - levels.shape[0]
+    padded_height, padded_width = (
+        side + (-side) % _BLOCK + _BLOCK for side in levels.shape
+    )  # whole blocks, plus one
+    sides = _BLOCK, padded_width - levels.shape[1], _BLOCK, padded_height - levels.shape[0]
     wide = F.pad(levels[None, None], sides, mode="reflect")[0, 0]
-    if launch_bound(levels):  # all at once
+    if launch_bound(levels):  # all offsets at once
         down, across = to_device_of(levels, np.array(_SHIFTS).T)
         return _thresholded(wide, levels.shape, down, across, basis, least).sum(0) / len(_SHIFTS)
     total = torch.zeros_like(levels)
@@ -222,18 +226,18 @@ def _without(levels: Tensor, threshold: np.ndarray) -> Tensor:
 def _thresholded(
     wide: Tensor, size: tuple[int, ...], down: Any, across: Any, basis: Tensor, threshold: Tensor
 ) -> Tensor:
-    """A picture of ``size (H, W)`` without its small coefficients, in blocks that begin at (down, across).
+    """Remove small coefficients from an image of ``size (H, W)``, in blocks that begin at (down, across).
 
-    ``wide`` is the picture with a block more on every side, and whole blocks. Indices ``(n,)`` give ``(n, H,
+    ``wide`` is the image padded by one block on every side to whole blocks. Offsets ``(n,)`` give ``(n, H,
     W)``.
     """
-    tall, broad = (side - _BLOCK for side in wide.shape)
-    windows = wide.as_strided((_BLOCK, _BLOCK, tall, broad), (*wide.stride(), *wide.stride()))
-    blocks = windows[down, across].reshape(-1, _BLOCK, broad // _BLOCK, _BLOCK)
+    padded_height, padded_width = (side - _BLOCK for side in wide.shape)
+    windows = wide.as_strided((_BLOCK, _BLOCK, padded_height, padded_width), (*wide.stride(), *wide.stride()))
+    blocks = windows[down, across].reshape(-1, _BLOCK, padded_width // _BLOCK, _BLOCK)
     coefficients = _transformed(blocks, basis)
     kept = coefficients * (coefficients.abs() >= threshold[:, None])
-    kept = _transformed(kept, basis.T).view(-1, tall, broad)
-    strides = tall * broad, broad, 1, broad, 1
+    kept = _transformed(kept, basis.T).view(-1, padded_height, padded_width)
+    strides = padded_height * padded_width, padded_width, 1, padded_width, 1
     back = kept.as_strided((len(kept), _BLOCK + 1, _BLOCK + 1, *size), strides)
-    which = 0 if isinstance(down, int) else torch.arange(len(kept), device=wide.device)
-    return back[which, _BLOCK - down, _BLOCK - across]
+    index = 0 if isinstance(down, int) else torch.arange(len(kept), device=wide.device)
+    return back[index, _BLOCK - down, _BLOCK - across]

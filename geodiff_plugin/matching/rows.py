@@ -1,8 +1,8 @@
-"""Matches along the rows of a rectified pair at full resolution, by OpenCV's semi-global matcher."""
+"""Matches the rows of a rectified pair at full resolution with OpenCV's semi-global matcher."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,18 +12,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._kernels import use_kernel
-from geodiff_plugin._threads import BackgroundTask, sent_to_cpu
-from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size_within
+from geodiff_plugin._internal.kernels import has_kernel
+from geodiff_plugin.cameras import PosedViews, View, eroded, is_rectified, size_within
 from geodiff_plugin.matching.census import grey
-from geodiff_plugin.matching.consistency import known_share
-from geodiff_plugin.matching.gaps import fill_background, find_gaps, hidden_gaps
-from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.occlusion import occlusion_order
-from geodiff_plugin.matching.uprights import certain_shear, upright_lines
-from geodiff_plugin.types import CameraView, PosedViews
+from geodiff_plugin.matching.consistency import known_fraction
+from geodiff_plugin.matching.constants import MIN_KEPT_CONFIDENCE, OCCLUDED_CONFIDENCE
+from geodiff_plugin.matching.gaps import Gaps, fill_background, find_gaps, occluded_gaps
+from geodiff_plugin.matching.matches import HalfOcclusions, Matches
+from geodiff_plugin.matching.planes import MIN_SHIFT_PX
 
-#: Parameters of OpenCV's matcher: keep what both views agree on, and drop speckles.
+#: Parameters of OpenCV's matcher: keep matches that both views agree on, and remove speckles.
 PARAMETERS = {
     "blockSize": 5,
     "uniquenessRatio": 10,
@@ -31,86 +29,95 @@ PARAMETERS = {
     "speckleRange": 2,
     "disp12MaxDiff": 1,
 }
-#: Shifts below so many pixels are too small to measure depth.
-MIN_SHIFT_PX = 0.3
-#: No shift exceeds this share of the image's width, which bounds the time of the search.
+#: Half width in pixels of the windows that must be completely valid: the matcher window, with a margin.
+VALID_RADIUS = 3
+#: Maximum shift as a fraction of the image width, which bounds the search time.
 MAX_SHIFT = 0.3
-#: Most pixels of the pictures that are matched; larger ones are made smaller.
-MOST_PIXELS = 600_000
-#: Confidence of what is put into a hidden strip where the matches around it know enough: it is a guess that
-#: the farther surface goes on, and on a blank wall the end of the strip is one as well.
-HIDDEN_CONFIDENCE = 0.8
-#: A match in a hidden strip is kept from this confidence on.
-LEAST_KEPT = 0.05
-
-
-class RowChecks(NamedTuple):
-    """What the rows of a rectified pair say about its pictures."""
-
-    shear: float  # of the right one along its rows, pixels per row, as far as it is certain (NaN: unknown)
-    occlusion: float  # [-1, 1], below 0 where what is matched as far hides what is near (NaN: unknown)
+#: Maximum number of pixels of the matched images; larger ones are downscaled.
+MAX_PIXELS = 600_000
 
 
 class RowMatches(NamedTuple):
-    """Matches along the rows of a rectified pair; maps ``(H, W)`` on the grid that they were sought on."""
+    """Row matches of a rectified pair; maps ``(H, W)`` on the grid of the matching."""
 
-    shift: Tensor  # pixels from where the point would be at infinity, >= 0
+    shift: Tensor  # pixels from the point's position at infinity, >= 0
     matched: Tensor  # 1 where both views agree, else 0
-    hidden: Tensor  # 1 in a gap between two that the right view cannot see (``hidden_gaps``)
-    filled: Tensor  # 1 in another gap between two; the shift of a gap is that of its farther end
-    baseline_m: Tensor  # () distance of the cameras, metres, on the CPU
-    checks: BackgroundTask[RowChecks]  # still being worked out while the maps are used: the verdict asks
+    occluded: Tensor  # 1 in a half-occlusion, a gap that the right view cannot see (``occluded_gaps``)
+    filled: Tensor  # 1 in other gaps between two matches; a gap has the shift of its farther end
+    baseline_m: Tensor  # () baseline, metres, on the CPU
 
     @property
     def certain(self) -> Tensor:
-        """1 where the shift is matched, or that of the surface which goes on behind a nearer one, else 0."""
-        return self.matched + self.hidden
+        """1 where the shift is matched, or belongs to a surface continuing behind a nearer one, else 0."""
+        return self.matched + self.occluded
 
 
-class RowPictures(NamedTuple):
-    """A rectified pair as its rows are matched; mirrored if its second view is on the left."""
+class RowImages(NamedTuple):
+    """A rectified pair in the form in which its rows are matched."""
 
-    greys: Callable[[], tuple[np.ndarray, np.ndarray]]  # left, right: (H, W) uint8; it waits for them
-    lines: BackgroundTask[np.ndarray]  # (N, 4), ``upright_lines`` of the left one
-    infinity_px: float  # disparity of a point at infinity
-    focal_px: float  # of the left one, along the rows
-    shift_m: np.floating[Any]  # of left points into the right frame, along the rows; above 0: mirrored
-    device: torch.device  # of the matches
+    levels: Tensor  # (2, H, W) uint8, left and right, on the device of the call
+    infinity_px: float  # disparity of a point at infinity, after mirroring
+    focal_px: float  # of the left camera, along the rows
+    shift_m: np.floating[Any]  # from left points to the right frame, along the rows
+    valid: np.ndarray | None = None  # (2, H, W) bool, compared pixels of both images; None for all
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the matches."""
+        return self.levels.device
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the second view is on the left; mirroring makes it a right view."""
+        return bool(self.shift_m > 0)
+
+    def greys(self, levels: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Return left and right image ``(H, W)`` uint8 from ``levels`` on the CPU, mirrored if necessary."""
+        both = (each[:, ::-1] if self.mirrored else each for each in levels.numpy())
+        left, right = map(np.ascontiguousarray, both)
+        return left, right
+
+    def compared(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """``valid`` of the left and of the right image, mirrored as ``greys``; ``None`` for all pixels."""
+        if self.valid is None:
+            return None
+        left, right = self.valid[..., ::-1] if self.mirrored else self.valid
+        return left, right
 
     def shift_px(self, inverse_depth: float) -> float:
-        """The shift of points at an inverse depth, 1/m."""
+        """Return the shift of points at an inverse depth, 1/m."""
         return inverse_depth * (self.focal_px * abs(float(self.shift_m)))
 
 
-def make_matcher(lowest: int, count: int, channels: int) -> Any:
-    """OpenCV's matcher for ``count`` disparities from ``lowest`` on, of images with ``channels`` channels."""
+def make_matcher(lowest: int, count: int, channels: int, mode: int = cv2.STEREO_SGBM_MODE_SGBM_3WAY) -> Any:
+    """Create OpenCV's matcher for ``count`` disparities from ``lowest``, for images with ``channels``."""
     area = channels * PARAMETERS["blockSize"] ** 2
     return cv2.StereoSGBM.create(
         minDisparity=lowest,
         numDisparities=count,
         P1=8 * area,
         P2=32 * area,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        mode=mode,
         **PARAMETERS,
     )
 
 
 def pad_columns(image: np.ndarray, count: int) -> np.ndarray:
-    """An image with its first column repeated ``count`` times: OpenCV leaves that many columns empty."""
+    """Repeat the first column ``count`` times: OpenCV leaves that many columns empty."""
     return cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE)
 
 
 def grid_of_rows(size: tuple[int, int]) -> tuple[int, int]:
-    """``(H, W)`` of the grid for a picture or map of a size: the same, within ``MOST_PIXELS``."""
-    return size_within(size, MOST_PIXELS)
+    """Return the matching grid ``(H, W)`` for an image or map size, limited to ``MAX_PIXELS``."""
+    return size_within(size, MAX_PIXELS)
 
 
 def _row_shifts(
     left: np.ndarray, right: np.ndarray, infinity_px: float, nearest_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts of grey levels ``(H, W)`` uint8 from infinity, float32 px, and where both views agree on one.
+    """Match grey levels ``(H, W)`` uint8; returns float32 shifts from infinity, and where views agree.
 
-    A point at infinity has the disparity ``infinity_px``; the search goes from there to ``nearest_px`` more.
+    A point at infinity has the disparity ``infinity_px``. The search covers ``nearest_px`` more.
     """
     lowest = int(np.floor(infinity_px))
     count = 16 * max(1, int(np.ceil(min(nearest_px + 4.0, MAX_SHIFT * left.shape[1]) / 16)))
@@ -120,46 +127,48 @@ def _row_shifts(
     shift = raw.astype(np.float32)
     shift /= 16.0
     shift -= np.float32(infinity_px)
-    return shift, shift >= MIN_SHIFT_PX  # OpenCV puts pixels without a match one pixel before the search
+    return shift, shift >= MIN_SHIFT_PX  # OpenCV puts unmatched pixels one pixel before the search
 
 
-def rectified_pictures(native: PosedViews) -> RowPictures | None:
-    """The left image and the first view that is rectified with it and of its size, if there is one.
+def rectified_images(native: PosedViews) -> RowImages | None:
+    """Return the left image and the first view of the same size that is rectified with it, if any.
 
-    ``native`` are the image and its right views, at their own sizes.
+    ``native`` has the image and its right views at native size.
     """
-    rectified = [v for v in native.views if is_rectified(native.K_left, v.K, v.T_right_from_left)]
-    view = next((v for v in rectified if image_size(v.image_01) == native.size), None)
-    if view is None:
+    same_size = (view for view in native.rights if view.size == native.size)
+    left = native.left
+    rectified = (v for v in same_size if is_rectified(left.camera, v.camera, v.T_right_from_left))
+    right = next(rectified, None)
+    if right is None:
         return None
     size = grid_of_rows(native.size)
-    left, K = resize_image(native.left_01.float(), native.K_left.float(), size)
-    right = CameraView(*resize_image(view.image_01.float(), view.K.float(), size), view.T_right_from_left)
-    return row_pictures(left, right, K)
+    return row_images(left.resized(size), right.resized(size))
 
 
-def row_pictures(left_01: Tensor, view: CameraView, K_left: Tensor) -> RowPictures:
-    """A rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side."""
-    K, K_right, T = (each.numpy(force=True) for each in (K_left, view.K, view.T_right_from_left))
+def row_images(left: View, right: View) -> RowImages:
+    """Convert a rectified pair of one size for row matching, with the right view on either side."""
+    K, K_right, T = left.camera.K, right.camera.K, right.T_right_from_left
     infinity, mirrored = float(K[0, 2] - K_right[0, 2]), bool(T[0, 3] > 0)
-    levels = grey(torch.stack([left_01, view.image_01]))[:, 0] * 255.0
-    received = sent_to_cpu(levels.round().byte())
-
-    def greys() -> tuple[np.ndarray, np.ndarray]:
-        # Mirrored, a view to the left becomes one to the right.
-        both = (each[:, ::-1] if mirrored else each for each in received().numpy())
-        left, right = map(np.ascontiguousarray, both)
-        return left, right
-
-    lines = BackgroundTask(lambda: upright_lines(greys()[0]), left_01.device)
+    levels = grey(torch.stack([left.image_01, right.image_01]))[:, 0] * 255.0
     infinity = -infinity if mirrored else infinity
-    return RowPictures(greys, lines, infinity, float(K[0, 0]), T[0, 3], left_01.device)
+    return RowImages(levels.round().byte(), infinity, float(K[0, 0]), T[0, 3], _valid_of(left, right))
+
+
+def _valid_of(left: View, right: View) -> np.ndarray | None:
+    """Return ``RowImages.valid`` for two views of one size."""
+    if left.valid is None and right.valid is None:
+        return None
+    masks = [
+        np.ones(v.size, bool) if v.valid is None else eroded(v.valid, VALID_RADIUS).cpu().numpy()
+        for v in (left, right)
+    ]
+    return np.stack(masks)
 
 
 def _to_device(layers: Sequence[np.ndarray], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Maps ``(H, W)`` as ``(C, H, W)`` on a device.
+    """Copy maps ``(H, W)`` as ``(C, H, W)`` to a device.
 
-    On CUDA the host does not wait for what the device still has to do, as with pageable memory it would.
+    On CUDA, pinned memory keeps the host from waiting for pending device work.
     """
     on_cuda = device.type == "cuda"
     staged = torch.empty(len(layers), *layers[0].shape, dtype=dtype, device="cpu", pin_memory=on_cuda)
@@ -167,55 +176,68 @@ def _to_device(layers: Sequence[np.ndarray], dtype: torch.dtype, device: torch.d
     return staged.to(device, non_blocking=on_cuda)
 
 
-def match_rows(pictures: RowPictures, nearest_px: float) -> RowMatches:
-    """Match the rows of a pair; ``nearest_px`` is the largest shift of the search."""
-    left, right = pictures.greys()
-    shift, known = _row_shifts(left, right, pictures.infinity_px, nearest_px)
-    gaps = find_gaps(known)
-    is_hidden = hidden_gaps(shift, gaps, pictures.infinity_px)
-    hidden, filled = (gaps.put(np.zeros_like(known), each) for each in (is_hidden, gaps.inner & ~is_hidden))
+class RowShifts(NamedTuple):
+    """Row shifts of a pair, mirrored if its second view is on the left."""
+
+    grey: np.ndarray  # (H, W) uint8, the left image
+    shift: np.ndarray  # (H, W) float32 pixels from the point's position at infinity
+    known: np.ndarray  # (H, W) bool, where both views agree on it
+    gaps: Gaps  # gaps of ``known``
+
+
+def match_rows(images: RowImages, greys: tuple[np.ndarray, np.ndarray], nearest_px: float) -> RowShifts:
+    """Match the rows of ``images.greys``; ``nearest_px`` is the maximum shift."""
+    left, right = greys
+    shift, known = _row_shifts(left, right, images.infinity_px, nearest_px)
+    compared = images.compared()
+    if compared is not None:
+        known &= compared[0] & _seen_valid(compared[1], shift + images.infinity_px)
+    return RowShifts(left, shift, known, find_gaps(known))
+
+
+def _seen_valid(valid: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Return whether the right pixels at a disparity ``(H, W)`` are valid; outside, the nearest counts."""
+    height, width = disparity.shape
+    column = np.rint(np.arange(width) - disparity).clip(0, width - 1).astype(int)
+    return valid[np.arange(height)[:, None], column]
+
+
+def row_matches(images: RowImages, shifts: RowShifts) -> RowMatches:
+    """Copy the matches of ``match_rows`` to the device of the pair, with filled gaps."""
+    _, shift, known, gaps = shifts
+    compared = images.compared()
+    inner = gaps.inner if compared is None else gaps.inner & gaps.all_of(compared[0])
+    is_occluded = occluded_gaps(shift, gaps, images.infinity_px) & inner
+    occluded, filled = (gaps.put(np.zeros_like(known), each) for each in (is_occluded, inner & ~is_occluded))
     whole = fill_background(shift, gaps) if known.any() else np.zeros_like(shift)
-    way = slice(None, None, -1 if pictures.shift_m > 0 else 1)  # mirrored pictures are mirrored back
-    (shift_on,) = _to_device([whole[:, way]], torch.float32, pictures.device)
-    kinds = [each[:, way] for each in (known, hidden, filled)]
-    matched, hidden_on, filled_on = _to_device(kinds, torch.bool, pictures.device).float()
-    baseline_m = torch.tensor(abs(pictures.shift_m), device="cpu")
-
-    def checked() -> RowChecks:
-        shear = certain_shear(pictures.lines.result(), shift, known)
-        return RowChecks(shear, occlusion_order(left, shift, gaps))
-
-    checks = BackgroundTask(checked, pictures.device)
-    return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, checks)
+    direction = slice(None, None, -1 if images.mirrored else 1)  # mirrored images are mirrored back
+    (shift_on,) = _to_device([whole[:, direction]], torch.float32, images.device)
+    kinds = [each[:, direction] for each in (known, occluded, filled)]
+    matched, occluded_on, filled_on = _to_device(kinds, torch.bool, images.device).float()
+    return RowMatches(
+        shift_on, matched, occluded_on, filled_on, torch.tensor(abs(images.shift_m), device="cpu")
+    )
 
 
-class HiddenStrips(NamedTuple):
-    """The strips of an image that the right view cannot see, ``(1, 1, h, w)`` each."""
-
-    inside: Tensor  # bool
-    inverse_depth: Tensor  # 1/m of the farther surface, which goes on in them
-
-
-def hidden_strips(rows: RowMatches, size: tuple[int, int], focal_px: float) -> HiddenStrips:
-    """The strips on a grid of ``size``; ``focal_px`` is the focal length on the grid of ``rows``."""
-    layers = torch.stack([rows.shift, rows.hidden])[None]
-    shift, hidden = F.interpolate(layers, size, mode="nearest-exact").split(1, 1)
-    return HiddenStrips((hidden > 0) & (shift > 0), shift / (focal_px * rows.baseline_m))
+def half_occlusions(rows: RowMatches, size: tuple[int, int], focal_px: float) -> HalfOcclusions:
+    """Return the half-occlusions on a grid of ``size``; ``focal_px`` belongs to the grid of ``rows``."""
+    layers = torch.stack([rows.shift, rows.occluded])[None]
+    shift, occluded = F.interpolate(layers, size, mode="nearest-exact").split(1, 1)
+    return HalfOcclusions((occluded > 0) & (shift > 0), shift / (focal_px * rows.baseline_m))
 
 
-def with_hidden(matches: Matches, strips: HiddenStrips) -> Matches:
-    """Matches ``(1, 1, h, w)`` with the depth of the farther surface in the strips, on their grid.
+@has_kernel(
+    "matching.kernels.windows.with_occluded",
+    when=lambda matches, strips: matches.deviation is not None,
+)
+def with_occluded(matches: Matches, strips: HalfOcclusions) -> Matches:
+    """Fill half-occlusions of matches ``(1, 1, h, w)`` with the depth of the farther surface, on their grid.
 
-    Nothing is matched there, and a fit would carry the nearer surface on until the image has an edge. They
-    count as much as the matches around them know (``known_share``).
+    They have no matches, and a fit would extend the nearer surface up to the next image edge. Their weight is
+    the data support by surrounding matches (``known_fraction``).
     """
-    if use_kernel(matches.confidence) and matches.deviation is not None:
-        from geodiff_plugin.matching import window_kernels as kernels
-
-        inverse_depth, confidence, deviation = kernels.with_hidden(matches, matches.deviation, strips)
-        return replace(matches, inverse_depth=inverse_depth, confidence=confidence, deviation=deviation)
-    put = strips.inside & (matches.confidence < LEAST_KEPT)
-    confidence = HIDDEN_CONFIDENCE * known_share(matches)
+    put = strips.inside & (matches.confidence < MIN_KEPT_CONFIDENCE)
+    confidence = OCCLUDED_CONFIDENCE * known_fraction(matches)
     return replace(
         matches,
         inverse_depth=torch.where(put, strips.inverse_depth, matches.inverse_depth),

@@ -1,1 +1,6 @@
-"""How the cameras stand to each other: given poses checked and refined, unknown ones estimated, captures."""
+"""Camera poses from sparse matches: checks and refines given poses, estimates unknown ones, solves captures.
+
+Belongs here: features and tracks, refinement of a pair or of several views, estimation without poses, and the
+reconstruction of a capture. ``trust`` decides whether a pose can be trusted.
+Layer 4: imports ``matching`` and below; imported by ``trust``, ``evidence``, ``capture`` and ``jobs``.
+"""

@@ -1,4 +1,4 @@
-"""Which convention of camera poses a capture was written in, by the residuals of its matches."""
+"""Detects the convention in which a capture's camera poses are written, from the residuals of its matches."""
 
 from __future__ import annotations
 
@@ -8,42 +8,42 @@ from typing import NamedTuple
 
 import numpy as np
 
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
-from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.reconstruction import Match
-from geodiff_plugin.pose.tracks import rays_through
 
-#: Matches of a pair that its residual is taken from, at most.
-MOST_PER_PAIR = 100
-#: Pairs that a convention is found by, at most.
-MOST_PAIRS = 200
-#: Another convention of the given poses is taken where it leaves this share of their misfit at most.
+#: Maximum number of matches of a pair that measure its residual.
+MAX_PER_PAIR = 100
+#: Maximum number of pairs used to detect a convention.
+MAX_PAIRS = 200
+#: Maximum ratio of another convention's misfit to the misfit of the given one for it to be chosen.
 CONVENTION_GAIN = 0.5
-#: A guessed convention is not trusted if the matches lie further off their epipolar lines, in shares of the
-#: focal length: under the poses of trackers they lay within half of it.
-MOST_GUESS = 0.007
+#: Maximum distance of the matches from their epipolar lines, relative to the focal length, at which a
+#: detected convention is trusted. Poses of trackers give at most half of it.
+MAX_GUESS_ERROR = 0.007
 AS_GIVEN = "as given"
-#: What pictures may be turned by against their cameras, quarters.
+#: Image rotations relative to the cameras that are tried, in quarter turns.
 QUARTERS = (0, 1, 2, 3)
 
 
 class Convention(NamedTuple):
-    """Given poses ``(N, 4, 4)`` as ours would have them, if they were written in a certain way."""
+    """Given poses ``(N, 4, 4)`` converted to this package's convention from an assumed one."""
 
     name: str
     E: np.ndarray
-    quarters: int = 0  # by how many the pictures are turned counter-clockwise against the cameras
+    quarters: int = 0  # counter-clockwise quarter turns of the images relative to the cameras
     off_px: float = 0.0  # median distance of the matches from their epipolar lines
-    off: float = 0.0  # the same in shares of the focal length
+    off: float = 0.0  # the same relative to the focal length
 
     @property
     def turned_deg(self) -> int:
-        """By how many degrees they are turned."""
+        """Counter-clockwise rotation of the images, degrees."""
         return 90 * self.quarters
 
 
 def _conventions(E: np.ndarray) -> Iterator[Convention]:
-    """Every way in which poses are written, with upright pictures first."""
+    """Yield every supported convention, those with upright images first."""
     forms = {
         AS_GIVEN: E,
         "with OpenGL's axes (y up, z backward)": E @ OPENGL_FROM_OPENCV,
@@ -59,10 +59,10 @@ def _conventions(E: np.ndarray) -> Iterator[Convention]:
 
 
 def residuals_px(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> list[np.ndarray]:
-    """Distances of the matches of every pair from their epipolar lines under poses, pixels."""
+    """Compute the distances of every pair's matches from their epipolar lines under poses, pixels."""
     distances = []
     for i, j, px_i, px_j in matches:
-        step = max(1, len(px_i) // MOST_PER_PAIR)
+        step = max(1, len(px_i) // MAX_PER_PAIR)
         T = np.linalg.inv(E[j]) @ E[i]
         x, y, z = T[:3, 3]
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -75,63 +75,63 @@ def residuals_px(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> list
 
 
 def median_px(distances: Sequence[np.ndarray]) -> float:
-    """Median over all pairs; NaN without any."""
+    """Return the median over all pairs; NaN without pairs."""
     return float(np.median(np.concatenate(distances))) if distances else math.nan
 
 
 def find_convention(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> Convention:
-    """How poses were written, by the matches; as given where nothing fits clearly better.
+    """Detect the convention of poses from the matches; as given if no other fits clearly better.
 
-    That pictures are turned against their cameras is found only where this fits clearly better than every
-    convention with upright ones. A camera that drives straight ahead does not tell.
+    A rotation of the images relative to their cameras is detected only if it fits clearly better than every
+    convention with upright images. A camera that moves straight ahead does not determine it.
 
     Args:
-        E: ``(N, 4, 4)`` as given.
-        K: ``(N, 3, 3)`` pixels.
-        matches: of pairs of frames.
+        E: ``(N, 4, 4)`` poses as given.
+        K: ``(N, 3, 3)`` intrinsics, pixels.
+        matches: matches of pairs of frames.
     """
-    some = matches[:: max(1, len(matches) // MOST_PAIRS)]
+    some = matches[:: max(1, len(matches) // MAX_PAIRS)]
     conventions = list(_conventions(E))
     misfits = [_misfit(each.E, K, some) for each in conventions]
     best = 0
-    for turned in (False, True):
-        among = [k for k, each in enumerate(conventions) if (each.quarters > 0) is turned]
+    for rotated in (False, True):
+        among = [k for k, each in enumerate(conventions) if (each.quarters > 0) is rotated]
         k = min(among, key=misfits.__getitem__)
         best = k if misfits[k] < CONVENTION_GAIN * misfits[best] else best
     off_px = median_px(residuals_px(conventions[best].E, K, some))
     return conventions[best]._replace(off_px=off_px, off=off_px / float(np.median(K[:, 0, 0])))
 
 
-def noted_convention(found: Convention) -> list[Message]:
-    """What the user is told of a convention; nothing if poses are read as given."""
+def reported_convention(found: Convention) -> list[Finding]:
+    """Return the findings about a detected convention; none if poses are used as given."""
     notes = []
     if found.quarters:
         sentence = (
-            f"The matches fit the poses, {found.name}, only if the pictures are turned by {found.turned_deg} "
-            "degrees counter-clockwise against their cameras: are they stored in another orientation than "
-            "the one that the poses and K are for?"
+            f"The matches fit the poses ({found.name}) only if the images are rotated by {found.turned_deg} "
+            "degrees counter-clockwise relative to their cameras. Check whether the images are stored in "
+            "another orientation than the one that the poses and K refer to."
         )
-        notes.append(Message("capture.turned", sentence))
+        notes.append(Finding("capture.rotated", sentence))
     elif found.name != AS_GIVEN:
-        sentence = f"The poses are read as {found.name}: as written, the matches contradict them."
-        notes.append(Message("capture.convention", sentence))
-    if notes and found.off > MOST_GUESS:
+        sentence = f"The poses are interpreted as {found.name}: as declared, they contradict the matches."
+        notes.append(Finding("capture.convention", sentence))
+    if notes and found.off > MAX_GUESS_ERROR:
         sentence = (
-            f"Even so the matches lie {found.off_px:.1f} px off their epipolar lines: the convention of the "
-            "poses is not known. Give camera-to-world poses of these pictures."
+            f"The matches are still {found.off_px:.1f} px from their epipolar lines, so the convention of "
+            "the poses is unknown. Pass camera-to-world poses of these images."
         )
-        notes.append(Message("capture.convention-unsure", sentence))
+        notes.append(Finding("capture.unknown-convention", sentence))
     return notes
 
 
 def _misfit(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> float:
-    """Median residual of matches under poses, pixels, over the share of points in front of both cameras."""
+    """Compute the median residual under poses, pixels, over the fraction of points in front of cameras."""
     ahead, count = 0, 0
     for i, j, px_i, px_j in matches:
         T = np.linalg.inv(E[j]) @ E[i]
-        a, b = rays_through(px_i, K[i]), rays_through(px_j, K[j])
+        a, b = Camera(K[i]).rays(px_i), Camera(K[j]).rays(px_j)
         a = a @ T[:3, :3].T
-        # z_j b = z_i a + t, in the least squares sense, for both depths.
+        # Solve z_j b = z_i a + t for both depths by least squares.
         aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
         at, bt = a @ T[:3, 3], b @ T[:3, 3]
         below = aa * bb - ab**2

@@ -1,8 +1,8 @@
-"""One solve for the poses of a whole capture: tracks over all frames, bundle adjustment, one scale.
+"""Solves for the poses of a whole capture: tracks over all frames, bundle adjustment, and one scale.
 
-A tracker's single baselines are wrong by 5 to 30 %, its whole trajectory and the depth of the scene under
-its poses by a few per cent. So the frames are adjusted together with the given positions as robust priors,
-and one factor brings the result to the scale on which trajectory and scene agree best.
+A tracker's single baselines are off by 5 to 30 %, its whole trajectory and the scene depth under its poses by
+a few per cent. The frames are therefore adjusted together with the given positions as robust priors, and one
+factor scales the result to the best agreement with trajectory and scene.
 """
 
 from __future__ import annotations
@@ -17,44 +17,44 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._certain import MAX_SCALE_SPREAD
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.conventions import find_convention, median_px, noted_convention, residuals_px
-from geodiff_plugin.pose.reconstruction import FEWEST_FOR_FOCAL, Match, Reconstruction, pycolmap
+from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin._internal.statistics import MAX_SCALE_SPREAD
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.findings import Finding, some_names
+from geodiff_plugin.pose.conventions import find_convention, median_px, reported_convention, residuals_px
+from geodiff_plugin.pose.reconstruction import MIN_FRAMES_FOR_FOCAL, Match, Reconstruction, pycolmap
 from geodiff_plugin.pose.refine import DEPTH_SPREAD, LENGTH_SPREAD
 
-#: A frame is matched with so many frames after it.
-AFTER = 6
-#: It is also matched with so many others that look at the same place.
-ELSEWHERE = 5
-#: These are turned by this much against it at most, degrees.
-MOST_TURN_DEG = 50.0
-#: Fewer observations than this connect no frame.
-FEWEST_OBSERVATIONS = 25
-#: Frames with less than this share of the usual features are blurred.
-BLURRED_SHARE = 0.15
-#: Rounds of triangulation and adjustment: most reprojection error, scale of the Cauchy loss, both pixels.
+#: Number of following frames that a frame is matched with.
+FOLLOWING = 6
+#: Number of other frames with the same view that a frame is also matched with.
+SAME_VIEW = 5
+#: Maximum rotation between those frames, degrees.
+MAX_ROTATION_DEG = 50.0
+#: Minimum number of observations that connect a frame.
+MIN_OBSERVATIONS = 25
+#: Frames with less than this fraction of the median number of features count as blurred.
+BLURRED_FRACTION = 0.15
+#: Rounds of triangulation and adjustment: maximum reprojection error and scale of the Cauchy loss, pixels.
 ROUNDS = ((20.0, 4.0), (8.0, 2.0), (3.0, 1.0))
-#: The furthest that the focal length may move, as a share of itself.
-MOST_FOCAL = 0.15
-#: A solve must leave less than this share of the residual of the given poses, or they are kept.
-LEAST_GAIN = 0.9
-#: Fewest matches of a frame that say which poses fit it.
-FEWEST_PER_FRAME = 50
-#: A scale from the trajectory is never known better than this: frames share errors that no spread shows.
+#: Maximum relative change of the focal length.
+MAX_FOCAL_CHANGE = 0.15
+#: Maximum ratio of the solve's residual to the residual of the given poses; otherwise these are kept.
+MIN_GAIN = 0.9
+#: Minimum number of matches for comparing the fit of a frame's poses.
+MIN_PER_FRAME = 50
+#: Minimum relative error of a scale from the trajectory: frames share errors that no spread shows.
 SCALE_FLOOR_TRAJECTORY = 0.02
-#: The same of a scale from the depth of the scene.
+#: Minimum relative error of a scale from the scene's depth.
 SCALE_FLOOR_DEPTH = 0.015
-#: Both scales are called in disagreement beyond this.
-DISAGREES = 0.1
-#: A given position is reported as wrong if the solve moves it this many times as far as the median one.
+#: Log ratio of both scales above which they are reported as inconsistent.
+MAX_LOG_RATIO = 0.1
+#: Multiple of the median displacement beyond which a given position is reported as wrong.
 FAR_TIMES = 10.0
-#: It also moves it by this share of the size of the trajectory, so that exact poses are not reported.
-FAR_SHARE = 0.1
-#: Names that a sentence gives.
-MOST_NAMES = 5
-#: Where one frame sees points of the solve, ``(n, 2)`` pixels, and the rows ``(n,)`` of these points.
+#: Fraction of the trajectory's size that the displacement must also exceed, so that accurate poses are not
+#: reported.
+FAR_FRACTION = 0.1
+#: Pixels ``(n, 2)`` at which one frame sees points of the solve, and the indices ``(n,)`` of these points.
 Observations = tuple[np.ndarray, np.ndarray]
 
 
@@ -62,44 +62,44 @@ Observations = tuple[np.ndarray, np.ndarray]
 class SolvedCapture:
     """Poses of all frames after the solve."""
 
-    status: str  # "given" (switched off), "kept" (no better poses), "solved" or "estimated" (from nothing)
-    E: np.ndarray  # (N, 4, 4) camera-to-world in the given poses' unit, NaN for a frame without any pose
-    E_given: np.ndarray | None  # the same as given
+    status: str  # "given" (not refined), "kept" (no better poses), "solved", or "estimated" (none given)
+    E: np.ndarray  # (N, 4, 4) camera-to-world in the given poses' unit, NaN for a frame without pose
+    E_given: np.ndarray | None  # the same, as given
     K: np.ndarray  # (N, 3, 3) pixels
-    connected: np.ndarray  # (N,) frames that the solve holds; the others keep their pose as given
+    connected: np.ndarray  # (N,) frames in the solve; the others keep their given pose
     points: np.ndarray  # (M, 3) world
-    seen: tuple[Observations, ...]  # of every frame
-    residual_px_given: float = math.nan  # median distance of matches from epipolar lines, poses as given
-    residual_px: float = math.nan  # the same with these
-    scale_trajectory: float = 1.0  # factor from the adjusted lengths to those of the given positions
-    scale_depth: float = 1.0  # the same to the depth of the scene under the given poses
-    scale_spread: float = math.nan  # relative standard deviation of the scale in use
-    notes: tuple[Message, ...] = ()
+    seen: tuple[Observations, ...]  # one entry per frame
+    residual_px_given: float = math.nan  # median epipolar distance under the given poses
+    residual_px: float = math.nan  # the same under the solved poses
+    scale_trajectory: float = 1.0  # factor from the adjusted lengths to the lengths of the given positions
+    scale_depth: float = 1.0  # factor to the depth of the scene under the given poses
+    scale_rel_std: float = math.nan  # relative standard deviation of the applied scale
+    findings: tuple[Finding, ...] = ()
+    overlays: np.ndarray | None = None  # (h, w) bool, static pixels of every frame, downscaled
 
-    def pose(self, of: int, beside: int) -> np.ndarray:
-        """``(4, 4)`` pose of frame ``beside`` in the frame of ``of``: both solved, or both as given."""
+    def pose(self, of: int, other: int) -> np.ndarray:
+        """Return the pose ``(4, 4)`` of frame ``other`` in frame ``of``: both solved, or both as given."""
         E = self.E
-        if self.E_given is not None and not (self.connected[of] and self.connected[beside]):
+        if self.E_given is not None and not (self.connected[of] and self.connected[other]):
             E = self.E_given
-        return np.linalg.inv(E[of]) @ E[beside]
+        return np.linalg.inv(E[of]) @ E[other]
 
     def moved(self) -> tuple[np.ndarray, np.ndarray]:
-        """How far each camera moved from its given pose, ``(N,)``, and turned, ``(N,)`` degrees."""
+        """Return each camera's displacement from its given pose, ``(N,)``, and rotation, ``(N,)`` degrees."""
         if self.E_given is None:
             return np.zeros(len(self.E)), np.zeros(len(self.E))
         given, solved = (Rotation.from_matrix(E[:, :3, :3]) for E in (self.E_given, self.E))
-        apart = np.linalg.norm(self.E[:, :3, 3] - self.E_given[:, :3, 3], axis=1)
-        return apart, np.degrees((given.inv() * solved).magnitude())
+        distances = np.linalg.norm(self.E[:, :3, 3] - self.E_given[:, :3, 3], axis=1)
+        return distances, np.degrees((given.inv() * solved).magnitude())
 
 
 @dataclass(frozen=True, eq=False)
 class GivenFrames:
-    """The cameras of all frames as they are given, and what notes call the frames."""
+    """The given cameras of all frames, and the frames' names for findings."""
 
     names: Sequence[str]
-    K: np.ndarray  # (N, 3, 3) pixels
-    E: np.ndarray | None  # (N, 4, 4) camera-to-world; ``None``: poses are estimated from nothing
-    sizes: Sequence[tuple[int, int]]  # (width, height)
+    cameras: Sequence[Camera]
+    E: np.ndarray | None  # (N, 4, 4) camera-to-world; ``None``: poses are estimated
 
 
 def solve_capture(
@@ -108,105 +108,102 @@ def solve_capture(
     """Solve for the poses of all frames.
 
     Args:
-        images: grey ``(H, W)`` uint8, free of distortion; read once, in order.
+        images: grey ``(H, W)`` uint8 without distortion, masked arrays if some pixels are not valid; read
+            once, in order.
         given: the cameras of the images.
-        poses: ``"refined"``, or ``"given"`` to keep the given ones and find points by them.
-        threads: of features, matching and adjustment.
+        poses: ``"refined"``, or ``"given"`` to keep the given ones and triangulate points with them.
+        threads: number of threads for features, matching and adjustment.
     """
     pycolmap()
     with tempfile.TemporaryDirectory(prefix="geodiff-capture-") as work:
-        base = Reconstruction(Path(work), np.asarray(given.K, float), given.sizes, threads)
+        base = Reconstruction(Path(work), given.cameras, threads)
         base.extract(images)
-        base.match(candidate_pairs(given.E, len(given.sizes)))
-        blurred = np.flatnonzero(base.features < BLURRED_SHARE * np.median(base.features))
-        notes: list[Message] = []
+        base.match(candidate_pairs(given.E, len(given.cameras)))
+        blurred = np.flatnonzero(base.features < BLURRED_FRACTION * np.median(base.features))
+        findings: list[Finding] = []
         if len(blurred):
-            these = _some_names([given.names[int(i)] for i in blurred])
-            sentence = f"{these}: blurred or without texture; they are no good neighbours of others."
-            notes.append(Message("capture.blurred", sentence))
+            these = some_names([given.names[int(i)] for i in blurred])
+            sentence = f"{these}: blurred or without texture, so they match other frames poorly."
+            findings.append(Finding("capture.blurred", sentence))
         if given.E is None:
-            result = _from_nothing(base, notes)
+            result = _from_nothing(base, findings)
         else:
-            E = _in_convention(base, np.asarray(given.E, float), notes)
-            result = _from_given(base, E, notes, poses == "refined")
-        return _noted(result, notes, given.names)
-
-
-def _some_names(names: Sequence[str]) -> str:
-    """Names for a sentence, the first few of many."""
-    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-    return ", ".join(names[:MOST_NAMES]) + more
+            E = _in_convention(base, np.asarray(given.E, float), findings)
+            result = _from_given(base, E, findings, poses == "refined")
+        return _with_findings(result, findings, given.names)
 
 
 def candidate_pairs(E: np.ndarray | None, count: int) -> list[tuple[int, int]]:
-    """Pairs of frames to match: those after each other, and those that look at one place by their poses."""
-    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + AFTER + 1))}
-    if E is None:  # nothing says what else overlaps: ever larger steps, and all pairs of a small capture
-        steps = range(1, count) if count <= 40 else [AFTER * 2**k for k in range(1, 6)]
+    """Return the pairs of frames to match: consecutive ones, and those with the same view by their poses."""
+    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + FOLLOWING + 1))}
+    if E is None:  # overlap unknown: growing steps, and all pairs of a small capture
+        steps = range(1, count) if count <= 40 else [FOLLOWING * 2**k for k in range(1, 6)]
         pairs |= {(i, i + step) for step in steps for i in range(0, count - step)}
         return sorted(pairs)
     centres, axes = E[:, :3, 3], E[:, :3, 2]
-    turns = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    angles = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
     for i in range(count):
-        apart = np.linalg.norm(centres - centres[i], axis=1)
-        cost = turns[i] / 30 + apart / max(float(np.median(apart)), 1e-9)
-        order = [j for j in np.argsort(cost) if abs(i - j) > AFTER and turns[i, j] < MOST_TURN_DEG]
-        pairs |= {(min(i, int(j)), max(i, int(j))) for j in order[:ELSEWHERE]}
+        distances = np.linalg.norm(centres - centres[i], axis=1)
+        cost = angles[i] / 30 + distances / max(float(np.median(distances)), 1e-9)
+        order = [j for j in np.argsort(cost) if abs(i - j) > FOLLOWING and angles[i, j] < MAX_ROTATION_DEG]
+        pairs |= {(min(i, int(j)), max(i, int(j))) for j in order[:SAME_VIEW]}
     return sorted(pairs)
 
 
 def _of_frames(matches: Sequence[Match], distances: Sequence[np.ndarray], count: int) -> np.ndarray:
-    """``(N,)`` median distance over the matches of every frame; NaN where it has too few."""
+    """Compute the median distance of every frame's matches, ``(N,)``; NaN for too few."""
     parts: list[list[np.ndarray]] = [[] for _ in range(count)]
     for (i, j, *_), distance in zip(matches, distances, strict=True):
         parts[i].append(distance)
         parts[j].append(distance)
-    return np.array([median_px(p) if sum(map(len, p)) >= FEWEST_PER_FRAME else math.nan for p in parts])
+    return np.array([median_px(p) if sum(map(len, p)) >= MIN_PER_FRAME else math.nan for p in parts])
 
 
-def _in_convention(base: Reconstruction, E: np.ndarray, notes: list[Message]) -> np.ndarray:
-    """The given poses in our convention, found by the residuals of the matches."""
+def _in_convention(base: Reconstruction, E: np.ndarray, findings: list[Finding]) -> np.ndarray:
+    """Convert the given poses from the convention detected by the matches' residuals."""
     if not base.matches:
-        sentence = "No two frames match: are they of one scene, and sharp? The poses were not checked."
-        notes.append(Message("capture.no-matches", sentence))
+        sentence = "No two frames match, so the poses were not checked. Are they sharp and of one scene?"
+        findings.append(Finding("capture.no-matches", sentence))
         return E
     found = find_convention(E, base.K_given, base.matches)
-    notes += noted_convention(found)
+    findings += reported_convention(found)
     return found.E
 
 
-def _from_given(base: Reconstruction, given: np.ndarray, notes: list[Message], refine: bool) -> SolvedCapture:
-    """Triangulate by the given poses, adjust, triangulate again; keep what is better, frame by frame."""
+def _from_given(
+    base: Reconstruction, given: np.ndarray, findings: list[Finding], refine: bool
+) -> SolvedCapture:
+    """Triangulate with the given poses, adjust, and triangulate again; keep the better pose of each frame."""
     matches = base.matches
     before = residuals_px(given, base.K_given, matches)
     as_given = (median_px(before),) * 2
 
-    def started() -> Any:
+    def triangulate_given() -> Any:
         return base.triangulated(base.model(given), ROUNDS[0][0])
 
-    start = started()
-    if not refine or start.num_points3D() < FEWEST_OBSERVATIONS:
+    start = triangulate_given()
+    if not refine or start.num_points3D() < MIN_OBSERVATIONS:
         return replace(_result(base, start, "given", given, as_given), E=given)
     by_given = base.depths(start)
-    focal = len(base) >= FEWEST_FOR_FOCAL
-    model = _adjusted(base, start, given, focal)
-    if focal and np.abs(base.K(model)[:, 0, 0] / base.K_given[:, 0, 0] - 1).max() > MOST_FOCAL:
-        sentence = "The focal length that fits best is far from the given one, which is kept."
-        notes.append(Message("capture.focal", sentence))
-        model = _adjusted(base, started(), given, False)
+    focal = len(base) >= MIN_FRAMES_FOR_FOCAL
+    model = _adjust(base, start, given, focal)
+    if focal and np.abs(base.K(model)[:, 0, 0] / base.K_given[:, 0, 0] - 1).max() > MAX_FOCAL_CHANGE:
+        sentence = "The best-fitting focal length is far from the given one, so the given one is kept."
+        findings.append(Finding("capture.focal", sentence))
+        model = _adjust(base, triangulate_given(), given, False)
     after = residuals_px(base.poses(model), base.K(model), matches)
-    if not median_px(after) < LEAST_GAIN * as_given[0]:
-        sentence = f"The given poses fit as well as any ({as_given[0]:.2f} px) and are kept."
-        notes.append(Message("capture.kept", sentence))
-        return replace(_result(base, started(), "kept", given, as_given), E=given)
+    if not median_px(after) < MIN_GAIN * as_given[0]:
+        sentence = f"No better poses were found: the given ones fit within {as_given[0]:.2f} px and are kept."
+        findings.append(Finding("capture.kept", sentence))
+        return replace(_result(base, triangulate_given(), "kept", given, as_given), E=given)
     result = _result(base, model, "solved", given, (as_given[0], median_px(after)))
     worse = _of_frames(matches, after, len(base)) > _of_frames(matches, before, len(base))
     result = replace(result, connected=result.connected & ~worse)
-    return _scaled(result, by_given, base.depths(model))
+    return _rescale(result, by_given, base.depths(model))
 
 
-def _adjusted(base: Reconstruction, model: Any, given: np.ndarray, focal: bool) -> Any:
-    """The model after all rounds; the focal length moves in the last."""
+def _adjust(base: Reconstruction, model: Any, given: np.ndarray, focal: bool) -> Any:
+    """Run all rounds on the model; the focal length is refined in the last."""
     for number, (error_px, loss_px) in enumerate(ROUNDS):
         if number:
             model = base.triangulated(model, error_px)
@@ -214,16 +211,16 @@ def _adjusted(base: Reconstruction, model: Any, given: np.ndarray, focal: bool) 
     return model
 
 
-def _scaled(
+def _rescale(
     result: SolvedCapture, by_given: list[dict[int, float]], solved: list[dict[int, float]]
 ) -> SolvedCapture:
-    """The capture at one scale, from the trajectory and from the depth of the scene under the given poses."""
+    """Scale the capture to the trajectory and to the depth of the scene under the given poses."""
     assert result.E_given is not None
     centres, given = result.E[:, :3, 3], result.E_given[:, :3, 3]
     ratios = np.full(len(centres), np.nan)
     for i, (a, b) in enumerate(zip(by_given, solved, strict=True)):
         logs = [math.log(a[k] / b[k]) for k in a.keys() & b.keys()]
-        if len(logs) >= FEWEST_OBSERVATIONS:
+        if len(logs) >= MIN_OBSERVATIONS:
             ratios[i] = np.median(logs)
 
     def middle(kept: np.ndarray) -> float:
@@ -236,37 +233,38 @@ def _scaled(
     blocks = np.array_split(np.arange(len(centres)), min(8, len(centres)))
     depth = _Estimate(0.0, math.inf)
     if np.isfinite(ratios).any():
-        depth = _jackknifed(middle, blocks, DEPTH_SPREAD).not_below(SCALE_FLOOR_DEPTH)
-    trajectory = _jackknifed(of_trajectory, blocks, LENGTH_SPREAD).not_below(SCALE_FLOOR_TRAJECTORY)
-    both = _combined(depth, trajectory)
+        depth = _jackknife(middle, blocks, DEPTH_SPREAD).not_below(SCALE_FLOOR_DEPTH)
+    trajectory = _jackknife(of_trajectory, blocks, LENGTH_SPREAD).not_below(SCALE_FLOOR_TRAJECTORY)
+    both = _combine(depth, trajectory)
     return replace(
-        _aligned(result, result.E_given, math.exp(both.value)),
+        _align(result, result.E_given, math.exp(both.value)),
         scale_trajectory=math.exp(trajectory.value),
         scale_depth=math.exp(depth.value),
-        scale_spread=both.spread,
+        scale_rel_std=both.spread,
     )
 
 
-def _aligned(result: SolvedCapture, E_given: np.ndarray, scale: float) -> SolvedCapture:
-    """The capture times a scale, turned and shifted to where the given poses ``(N, 4, 4)`` have it."""
+def _align(result: SolvedCapture, E_given: np.ndarray, scale: float) -> SolvedCapture:
+    """Scale the capture, and rotate and shift it to the given poses ``(N, 4, 4)``."""
     centres, given = result.E[:, :3, 3], E_given[:, :3, 3]
-    # Directions of view count three times as much as places: places on a line leave a turn about it open.
-    reach = 3.0 * float(np.median(np.linalg.norm(given - np.median(given, axis=0), axis=1)))
+    # Viewing directions count three times as much as positions: positions on a line leave a rotation
+    # undetermined.
+    radius = 3.0 * float(np.median(np.linalg.norm(given - np.median(given, axis=0), axis=1)))
 
     def with_directions(places: np.ndarray, E: np.ndarray) -> np.ndarray:
-        """Places ``(N, 3)``, and the points that lie before them along the axes of each camera."""
-        return np.concatenate([places, *(places + reach * E[:, :3, axis] for axis in range(3))])
+        """Append to positions ``(N, 3)`` the points in front of them along the axes of each camera."""
+        return np.concatenate([places, *(places + radius * E[:, :3, axis] for axis in range(3))])
 
     _, Q = _similarity(with_directions(scale * centres, result.E), with_directions(given, E_given))
-    turned = scale * centres @ Q.T
-    shift = np.median(given - turned, axis=0)
+    rotated = scale * centres @ Q.T
+    shift = np.median(given - rotated, axis=0)
     E = result.E.copy()
-    E[:, :3, :3], E[:, :3, 3] = Q @ E[:, :3, :3], turned + shift
+    E[:, :3, :3], E[:, :3, 3] = Q @ E[:, :3, :3], rotated + shift
     return replace(result, E=E, points=scale * result.points @ Q.T + shift)
 
 
 class _Estimate(NamedTuple):
-    """The log of a scale, and its standard error."""
+    """The log of a scale and its standard error."""
 
     value: float
     spread: float
@@ -275,21 +273,21 @@ class _Estimate(NamedTuple):
         return self._replace(spread=math.hypot(self.spread, floor))
 
 
-def _combined(a: _Estimate, b: _Estimate) -> _Estimate:
-    """The mean weighted by the inverse variances, and its standard error with what the two disagree by."""
+def _combine(a: _Estimate, b: _Estimate) -> _Estimate:
+    """Average with inverse-variance weights; the standard error includes the disagreement of both values."""
     weights = np.array([a.spread, b.spread]) ** -2.0
-    shares = weights / weights.sum()
-    value = float(shares @ (a.value, b.value))
-    disagreement = math.sqrt(float(shares.prod())) * abs(a.value - b.value)
+    fractions = weights / weights.sum()
+    value = float(fractions @ (a.value, b.value))
+    disagreement = math.sqrt(float(fractions.prod())) * abs(a.value - b.value)
     return _Estimate(value, math.hypot(float(weights.sum() ** -0.5), disagreement))
 
 
-def _jackknifed(
+def _jackknife(
     statistic: Callable[[np.ndarray], float], blocks: Sequence[np.ndarray], of_two: float
 ) -> _Estimate:
-    """A statistic of all frames and its standard error, by leaving out one stretch of frames at a time.
+    """Compute a statistic of all frames and its jackknife standard error, leaving out blocks of frames.
 
-    That of two frames, of which none can be left out, is ``of_two``.
+    With two frames, neither of which can be left out, the error is ``of_two``.
     """
     every = np.concatenate(blocks)
     value = statistic(every)
@@ -301,16 +299,16 @@ def _jackknifed(
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
-    """Scale and rotation that bring points ``a`` to ``b``, robust against single wrong ones."""
+    """Compute scale and rotation from points ``a`` to ``b``, robust against single outliers."""
     weights = np.ones(len(a))
     for _ in range(10):
-        share = weights / weights.sum()
-        mean_a, mean_b = share @ a, share @ b
+        fraction = weights / weights.sum()
+        mean_a, mean_b = fraction @ a, fraction @ b
         x, y = a - mean_a, b - mean_b
-        U, D, V = np.linalg.svd((y * share[:, None]).T @ x)
+        U, D, V = np.linalg.svd((y * fraction[:, None]).T @ x)
         signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ V))])
         Q = U @ np.diag(signs) @ V
-        scale = float((D * signs).sum() / max((share * (x**2).sum(1)).sum(), 1e-18))
+        scale = float((D * signs).sum() / max((fraction * (x**2).sum(1)).sum(), 1e-18))
         off = np.linalg.norm(y - scale * x @ Q.T, axis=1)
         weights = 1 / (1 + (off / max(2.0 * float(np.median(off)), 1e-9)) ** 2)
     return scale, Q
@@ -319,7 +317,7 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
 def _result(
     base: Reconstruction, model: Any, status: str, given: np.ndarray | None, residuals: tuple[float, float]
 ) -> SolvedCapture:
-    """What a model says, in its world's frame."""
+    """Extract the capture from a model, in its world frame."""
     by_number = dict(model.points3D.items())  # every access of the property copies all points
     E, numbers = base.poses(model), sorted(by_number)
     rows, seen = {number: row for row, number in enumerate(numbers)}, []
@@ -328,7 +326,7 @@ def _result(
         pairs = [(p.xy, rows[p.point3D_id]) for p in image.points2D if p.has_point3D()] if image else []
         px = np.array([xy for xy, _ in pairs]).reshape(-1, 2)
         seen.append((base.pixels(i, px), np.array([row for _, row in pairs], int)))
-    enough = np.array([len(points) >= FEWEST_OBSERVATIONS for _, points in seen])
+    enough = np.array([len(points) >= MIN_OBSERVATIONS for _, points in seen])
     return SolvedCapture(
         status,
         E,
@@ -341,47 +339,46 @@ def _result(
     )
 
 
-def _noted(result: SolvedCapture, notes: list[Message], names: Sequence[str]) -> SolvedCapture:
-    """The capture with sentences on its scale and on frames that are not connected."""
-    ratio, spread = result.scale_trajectory / result.scale_depth, result.scale_spread
-    if abs(math.log(ratio)) > DISAGREES:
+def _with_findings(result: SolvedCapture, findings: list[Finding], names: Sequence[str]) -> SolvedCapture:
+    """Add findings about the scale and about unconnected frames to the capture."""
+    ratio, spread = result.scale_trajectory / result.scale_depth, result.scale_rel_std
+    if abs(math.log(ratio)) > MAX_LOG_RATIO:
         sentence = (
-            "The given positions, and the depth of the scene under the given poses, give scales that are "
-            f"{100 * abs(ratio - 1):.0f} % apart; their mean is used. Give --known-length for an exact one."
+            "The scales from the given positions and from the scene depth under the given poses differ by "
+            f"{100 * abs(ratio - 1):.0f} %; their mean is used. Pass --known-length for an exact one."
         )
-        notes.append(Message("capture.scales", sentence))
+        findings.append(Finding("capture.scales", sentence))
     if spread > MAX_SCALE_SPREAD:
-        sentence = f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one."
-        notes.append(Message("capture.scale", sentence))
+        sentence = f"The scale is uncertain by {100 * spread:.0f} %. Pass --known-length for an exact one."
+        findings.append(Finding("capture.scale", sentence))
     if result.status == "solved" and result.E_given is not None:
         moved, size = result.moved()[0], np.linalg.norm(np.ptp(result.E_given[:, :3, 3], axis=0))
-        least = max(FAR_TIMES * float(np.nanmedian(moved)), FAR_SHARE * float(size))
+        least = max(FAR_TIMES * float(np.nanmedian(moved)), FAR_FRACTION * float(size))
         far = result.connected & (moved > least)  # the others keep their poses
         if wrong := [name for name, is_far in zip(names, far, strict=True) if is_far]:
             sentence = (
-                f"The given poses of {_some_names(wrong)} are far from where the pictures put these frames, "
-                "and are not used."
+                f"The given poses of {some_names(wrong)} are far from the solved ones and are not used."
             )
-            notes.append(Message("capture.wrong-poses", sentence))
+            findings.append(Finding("capture.wrong-poses", sentence))
     lost = [name for name, connected in zip(names, result.connected, strict=True) if not connected]
     if lost and result.status != "given":
-        kept = "have no pose and are skipped" if result.E_given is None else "keep their poses as given"
-        kept = f"share too few points or fit worse when moved, and {kept}"
-        sentence = f"{len(lost)} of {len(names)} frames {kept}: {_some_names(lost)}."
-        notes.append(Message("capture.unconnected", sentence))
-    return replace(result, notes=tuple(notes))
+        kept = "have no pose and are skipped" if result.E_given is None else "keep their given poses"
+        kept = f"share too few points or fit worse when refined, and {kept}"
+        sentence = f"{len(lost)} of {len(names)} frames {kept}: {some_names(lost)}."
+        findings.append(Finding("capture.unconnected", sentence))
+    return replace(result, findings=tuple(findings))
 
 
-def _from_nothing(base: Reconstruction, notes: list[Message]) -> SolvedCapture:
-    """Structure from motion without given poses; the largest model."""
+def _from_nothing(base: Reconstruction, findings: list[Finding]) -> SolvedCapture:
+    """Run structure from motion without given poses and return the largest model."""
     models = base.from_nothing()
     if not models:
-        cure = "Take photographs that overlap by two thirds, of a scene with texture, moving sideways."
-        bad_value("the frames", "connected by matches", "no two that are", cure)
+        hint = "Take images that overlap by two thirds, of a textured scene, while moving sideways."
+        bad_value("the frames", "connected by matches", "no connected pair", hint)
     E, K = base.poses(models[0]), base.K(models[0])
     there = np.isfinite(E).all((1, 2))
     after = median_px(residuals_px(E, K, [m for m in base.matches if there[[m.i, m.j]].all()]))
-    if len(models) > 1 and not there.all():  # another model may hold frames of the largest alone
-        sentence = f"The frames form {len(models)} parts that are not connected; the largest is used."
-        notes.append(Message("capture.parts", sentence))
+    if len(models) > 1 and not there.all():  # another model may contain frames of the largest one
+        sentence = f"The frames form {len(models)} unconnected parts; the largest is used."
+        findings.append(Finding("capture.components", sentence))
     return _result(base, models[0], "estimated", None, (math.nan, after))

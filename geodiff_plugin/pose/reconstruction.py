@@ -1,36 +1,40 @@
-"""COLMAP's part of the poses of a capture: features, matches, triangulation, bundle adjustment (pycolmap)."""
+"""COLMAP steps for the poses of a capture: features, matches, triangulation, bundle adjustment (pycolmap)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import torch
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin._signals import keeping_sigterm
-from geodiff_plugin.pose.tracks import sift_features
+from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin._internal.signals import keeping_sigterm
+from geodiff_plugin.cameras import Camera, Size, resized_mask, resized_px, scaled_size
+from geodiff_plugin.pose.overlays import moving, static_features
+from geodiff_plugin.pose.tracks import sift_features, surrounded
 
-#: Longer side of the images that features are sought in, pixels.
+#: Longer side of the images for feature extraction, pixels.
 LONG_SIDE = 800
-#: Most features of an image, which bounds the time of matching.
-MOST_FEATURES = 2000
-#: Their least contrast.
+#: Maximum number of features per image, which bounds the matching time.
+MAX_FEATURES = 2000
+#: Contrast threshold of the features.
 CONTRAST = 0.02
-#: Fewer inliers than this are no match of two frames.
-FEWEST_INLIERS = 20
-#: Standard deviation of given positions, as a share of the frames' spread; a tracker drifts by some per cent.
-POSITION_SHARE = 0.03
-#: Frames below which the focal length is kept as given.
-FEWEST_FOR_FOCAL = 20
+#: Minimum number of inliers for a match of two frames.
+MIN_INLIERS = 20
+#: Standard deviation of given positions relative to the frames' extent; a tracker drifts by a few per cent.
+POSITION_FRACTION = 0.03
+#: Minimum number of frames for refining the focal length.
+MIN_FRAMES_FOR_FOCAL = 20
 
 
 class Match(NamedTuple):
-    """Two frames, and the pixels ``(n, 2)`` of each that show the same points."""
+    """Two frames and the pixels ``(n, 2)`` of each that show the same points."""
 
     i: int
     j: int
@@ -39,52 +43,53 @@ class Match(NamedTuple):
 
 
 def pycolmap() -> Any:
-    """The package, quiet; ``InputError`` where it is not installed."""
+    """Import the package with logging reduced; ``InputError`` if it is not installed."""
     try:
         with keeping_sigterm():
             import pycolmap
     except ImportError:
-        cure = "pip install 'geodiff-plugin[capture]', or pip install pycolmap."
-        bad_value("pycolmap", "installed to solve for the poses of a capture", "missing", cure)
+        hint = "Run pip install 'geodiff-plugin[capture]', or pip install pycolmap."
+        bad_value("pycolmap", "installed to solve for the poses of a capture", "missing", hint)
     pycolmap.logging.minloglevel = 3
     return pycolmap
 
 
 class Reconstruction:
-    """COLMAP's data base of one capture, in the folder ``work``, and the models that are made from it.
+    """COLMAP database of one capture, in the folder ``work``, and the models made from it.
 
-    ``K (N, 3, 3)`` pixels and ``sizes`` ``(width, height)`` are those of the frames. ``features (N,)``, how
-    many each frame has, are there after ``extract``, ``matches`` of all pairs that match after ``match``.
+    ``cameras`` are the frames' cameras without distortion; ``K_given (N, 3, 3)`` are their intrinsics.
+    ``features (N,)``, the number per frame, is set by ``extract``; ``matches`` of all matching pairs by
+    ``match``.
     """
 
-    def __init__(self, work: Path, K: np.ndarray, sizes: Sequence[tuple[int, int]], threads: int) -> None:
+    def __init__(self, work: Path, cameras: Sequence[Camera], threads: int) -> None:
         self._work, self._path, self._threads = work, work / "features.db", threads
-        self.K_given, self._sizes = K, list(sizes)
-        self._factors = np.array([min(1.0, LONG_SIDE / max(size)) for size in sizes])
-        cameras = [(*size, *np.round(k, 6).ravel()) for size, k in zip(sizes, K, strict=True)]
-        kinds = {camera: number for number, camera in enumerate(dict.fromkeys(cameras), 1)}
-        self._camera_of = [kinds[camera] for camera in cameras]
+        self._given, self._downscaled = list(cameras), [_downscaled(camera) for camera in cameras]
+        self.K_given = np.stack([camera.K for camera in cameras])
+        different = [(camera.size, *np.round(camera.K, 6).ravel()) for camera in cameras]
+        kinds = {camera: number for number, camera in enumerate(dict.fromkeys(different), 1)}
+        self._camera_of = [kinds[camera] for camera in different]
         self.features = np.zeros(len(cameras), int)
         self.matches: list[Match] = []
 
     def __len__(self) -> int:
-        return len(self._sizes)
+        return len(self._given)
 
     def _cameras(self) -> Iterator[Any]:
-        """Every camera once, on the grid of its features and in COLMAP's pixels."""
+        """Yield every camera once, on the grid of its features and in COLMAP's pixels."""
         for number in sorted(set(self._camera_of)):
-            i = self._camera_of.index(number)
-            (width, height), K, factor = self._sizes[i], self.K_given[i], self._factors[i]
-            params = [K[0, 0] * factor, K[1, 1] * factor, (K[0, 2] + 0.5) * factor, (K[1, 2] + 0.5) * factor]
-            size = {"width": round(width * factor), "height": round(height * factor)}
+            camera = self._downscaled[self._camera_of.index(number)]
+            (fx, _, cx), (_, fy, cy), _ = camera.K
+            size = dict(zip(("width", "height"), camera.known_size, strict=True))
+            params = [fx, fy, cx + 0.5, cy + 0.5]
             yield pycolmap().Camera(model="PINHOLE", params=params, camera_id=number, **size)
 
     def pixels(self, i: int, px: np.ndarray) -> np.ndarray:
-        """COLMAP's pixels of the features' grid -> pixels of frame ``i``."""
-        return px / self._factors[i] - 0.5
+        """Convert COLMAP pixels of the feature grid to pixels of frame ``i``."""
+        return resized_px(px - 0.5, self._downscaled[i].known_size, self._given[i].known_size)
 
     def extract(self, images: Iterable[np.ndarray]) -> None:
-        """Write cameras, images and their features."""
+        """Write cameras, images and their features to the database."""
         colmap = pycolmap()
         with colmap.Database.open(self._path) as base, ThreadPoolExecutor(self._threads) as pool:
             for camera in self._cameras():
@@ -93,7 +98,9 @@ class Reconstruction:
                 rig = colmap.Rig(rig_id=camera.camera_id)
                 rig.add_ref_sensor(camera.sensor_id)
                 base.write_rig(rig, use_rig_id=True)
-            for i, (px, descriptors) in enumerate(pool.map(_features, images, self._factors)):
+            sizes = [camera.known_size for camera in self._downscaled]
+            found = list(pool.map(_features, images, sizes))
+            for i, (px, descriptors) in enumerate(_without_overlays(found, sizes)):
                 image = colmap.Image(name=_name(i), camera_id=self._camera_of[i], image_id=i + 1)
                 base.write_image(image, use_image_id=True)
                 frame = colmap.Frame(frame_id=i + 1, rig_id=self._camera_of[i])
@@ -105,7 +112,7 @@ class Reconstruction:
                 self.features[i] = len(px)
 
     def match(self, pairs: Sequence[tuple[int, int]]) -> None:
-        """Match pairs of frames and keep what one motion explains."""
+        """Match pairs of frames and keep the matches consistent with one motion."""
         colmap = pycolmap()
         names = self._path.with_suffix(".pairs.txt")
         names.write_text("\n".join(f"{_name(i)} {_name(j)}" for i, j in pairs), encoding="utf-8")
@@ -113,7 +120,7 @@ class Reconstruction:
         matching.num_threads, matching.use_gpu = self._threads, False
         pairing.match_list_path = str(names)
         verification = colmap.TwoViewGeometryOptions()
-        verification.ransac.random_seed, verification.min_num_inliers = 0, FEWEST_INLIERS
+        verification.ransac.random_seed, verification.min_num_inliers = 0, MIN_INLIERS
         verification.detect_watermark = False
         colmap.match_image_pairs(self._path, matching, pairing, verification, colmap.Device.cpu)
         with colmap.Database.open(self._path) as base:
@@ -126,7 +133,7 @@ class Reconstruction:
                     self.matches.append(Match(i, j, *both))
 
     def model(self, E: np.ndarray) -> Any:
-        """A model of posed frames without points."""
+        """Create a model of posed frames without points."""
         colmap = pycolmap()
         model = colmap.Reconstruction()
         for camera in self._cameras():
@@ -143,13 +150,13 @@ class Reconstruction:
         return options
 
     def triangulated(self, model: Any, error_px: float) -> Any:
-        """The model with new points: tracks that its poses explain to so many pixels."""
+        """Return the model with new points: tracks consistent with its poses within ``error_px``."""
         options = self._options()
         options.mapper.filter_max_reproj_error, options.mapper.filter_min_tri_angle = error_px, 1.0
         options.ba_global_max_refinements = 1
         rules = options.triangulation
         rules.complete_max_reproj_error = rules.merge_max_reproj_error = error_px
-        focal = float(np.median(self.K_given[:, 0, 0] * self._factors))
+        focal = float(np.median([camera.K[0, 0] for camera in self._downscaled]))
         angle_deg = max(0.3, math.degrees(error_px / focal))
         rules.create_max_angle_error = rules.continue_max_angle_error = angle_deg
         rules.min_angle = 1.0
@@ -158,7 +165,7 @@ class Reconstruction:
         return pycolmap().triangulate_points(model, self._path, work, str(out), True, options, False)
 
     def adjust(self, model: Any, given: np.ndarray, loss_px: float, focal: bool) -> None:
-        """Bundle adjustment with the given positions as robust priors, and the focal length if wanted."""
+        """Run bundle adjustment with the given positions as robust priors, optionally of the focal length."""
         colmap = pycolmap()
         options = colmap.BundleAdjustmentOptions()
         options.print_summary = options.refine_extra_params = options.refine_principal_point = False
@@ -175,7 +182,7 @@ class Reconstruction:
             colmap.PosePrior(
                 corr_data_id=model.image(i + 1).data_id,
                 position=given[i, :3, 3],
-                position_covariance=np.eye(3) * (POSITION_SHARE * spread) ** 2,
+                position_covariance=np.eye(3) * (POSITION_FRACTION * spread) ** 2,
                 coordinate_system=colmap.PosePriorCoordinateSystem.CARTESIAN,
             )
             for i in range(len(self))
@@ -186,23 +193,24 @@ class Reconstruction:
         colmap.create_pose_prior_bundle_adjuster(options, how, config, priors, model).solve()
 
     def from_nothing(self) -> list[Any]:
-        """Models by incremental structure from motion, the largest first."""
+        """Run incremental structure from motion and return its models, the largest first."""
         options = self._options()
-        options.min_model_size, options.ba_refine_focal_length = 3, len(self) >= FEWEST_FOR_FOCAL
+        options.min_model_size, options.ba_refine_focal_length = 3, len(self) >= MIN_FRAMES_FOR_FOCAL
         models = pycolmap().incremental_mapping(self._path, str(self._work), str(self._work), options)
         return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
     def K(self, model: Any) -> np.ndarray:
-        """``(N, 3, 3)`` of a model, pixels of the frames."""
-        K = self.K_given.copy()
+        """Return the intrinsics ``(N, 3, 3)`` of a model, pixels of the frames."""
         params = {number: np.array(camera.params) for number, camera in model.cameras.items()}
-        for i in range(len(self)):
-            fx, fy, cx, cy = params[self._camera_of[i]] / self._factors[i]
-            K[i, [0, 1, 0, 1], [0, 1, 2, 2]] = fx, fy, cx - 0.5, cy - 0.5
-        return K
+        Ks = []
+        for number, given, downscaled in zip(self._camera_of, self._given, self._downscaled, strict=True):
+            K = downscaled.K.copy()
+            K[[0, 1, 0, 1], [0, 1, 2, 2]] = params[number] - (0, 0, 0.5, 0.5)
+            Ks.append(replace(downscaled, K=K).resized(given.known_size).K)
+        return np.stack(Ks)
 
     def poses(self, model: Any) -> np.ndarray:
-        """``(N, 4, 4)`` camera-to-world of a model, NaN where it has none."""
+        """Return the camera-to-world poses ``(N, 4, 4)`` of a model, NaN without pose."""
         E = np.full((len(self), 4, 4), np.nan)
         for i in range(len(self)):
             if model.exists_image(i + 1) and model.image(i + 1).has_pose:
@@ -211,7 +219,7 @@ class Reconstruction:
         return E
 
     def depths(self, model: Any) -> list[dict[int, float]]:
-        """For every frame the depth of its features that are points of a model and lie in front of it."""
+        """Return, for every frame, the depths of its features that are model points in front of it."""
         xyz = {number: point.xyz for number, point in model.points3D.items()}
         depths: list[dict[int, float]] = []
         for i in range(len(self)):
@@ -223,15 +231,42 @@ class Reconstruction:
         return depths
 
 
+def _without_overlays(
+    features: Sequence[tuple[np.ndarray, np.ndarray]], sizes: Sequence[Size]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Drop features of images of one size that stay at one pixel while the camera moves."""
+    places = np.zeros((0, 2))
+    if len(set(sizes)) == 1:
+        places = static_features([px[:, :2] for px, _ in features], [each for _, each in features])
+    for px, descriptors in features:
+        kept = moving(px[:, :2], places)
+        yield px[kept], descriptors[kept]
+
+
 def _name(i: int) -> str:
     return f"{i:06d}"
 
 
-def _features(image: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """RootSIFT of an image: ``(n, 4)`` COLMAP's pixels, scale and angle; ``(n, 128)`` uint8."""
-    if factor < 1:
-        size = round(image.shape[1] * factor), round(image.shape[0] * factor)
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    points, root = (values[:MOST_FEATURES] for values in sift_features(image, MOST_FEATURES, CONTRAST))
+def _downscaled(camera: Camera) -> Camera:
+    """Return the camera of the downscaled image used for feature extraction."""
+    width, height = camera.known_size
+    factor = min(1.0, LONG_SIDE / max(width, height))
+    return camera.resized(scaled_size((height, width), factor, factor)[::-1])
+
+
+def _features(image: np.ndarray, size: Size) -> tuple[np.ndarray, np.ndarray]:
+    """Compute RootSIFT features of an image at another size, which show no pixels that are masked.
+
+    Returns:
+        ``(n, 4)`` COLMAP pixels, scale and angle; ``(n, 128)`` uint8.
+    """
+    grey = np.ma.getdata(image)
+    if grey.shape[::-1] != size:
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    points, root = (values[:MAX_FEATURES] for values in sift_features(grey, MAX_FEATURES, CONTRAST))
+    if np.ma.is_masked(image):
+        valid = resized_mask(torch.from_numpy(~np.ma.getmaskarray(image)), grey.shape).numpy()
+        kept = surrounded(valid, points[:, :2], points[:, 2])
+        points, root = points[kept], root[kept]
     px = np.c_[points[:, :2] + 0.5, points[:, 2] / 2, np.radians(points[:, 3])].astype(np.float32)
     return px, np.clip(np.rint(512 * root), 0, 255).astype(np.uint8)

@@ -1,4 +1,10 @@
-"""Diffusion depth priors, one file each; ``PRIORS`` lists them, ``find_prior`` finds one by name (S4)."""
+"""Diffusion depth priors, one adapter per file; ``PRIORS`` lists them, ``find_prior`` finds one (paper S4).
+
+To add a prior, add a file with a ``DepthPrior`` and a row of ``PRIORS``; tests/contracts/test_priors.py picks
+it up (docs/how-to/extending.md). diffusers is imported from this layer on.
+Layer 8: imports ``evidence`` and below; imported by ``runtime``, ``bundled`` and ``jobs``. Priors have no
+access to cameras.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +16,11 @@ from typing import Any
 import torch
 from diffusers import DiffusionPipeline
 
-from geodiff_plugin._checks import bad_type, bad_value, check_choice
+from geodiff_plugin._internal.checks import bad_type, bad_value, check_choice
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
 from geodiff_plugin.priors.geowizard import GeoWizardPipeline
-from geodiff_plugin.priors.loading import BUNDLED_FOLDER, Layout, fetch, no_bars, reading, refuse
+from geodiff_plugin.priors.loading import BUNDLED_FOLDER, Layout, check_supported, fetch, no_bars, reading
 from geodiff_plugin.priors.lotus import LotusPipeline
 from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPipeline
 from geodiff_plugin.priors.marigold import E2EFTPrior, MarigoldPrior
@@ -26,7 +32,8 @@ from geodiff_plugin.scale.space import SPACES
 
 __all__ = ["BUNDLED_FOLDER", "PRIORS", "DepthPrior", "PriorSource", "find_prior", "load_prior", "prior_of"]
 
-#: The first adapter that recognises a folder loads it, so specific ones stand before general ones.
+#: Adapters by key. The first one that recognises a folder loads it, so specific adapters precede general
+#: ones.
 PRIORS: dict[str, type[DepthPrior]] = {
     "marigold-v2": MarigoldV2Pipeline,
     "geowizard": GeoWizardPipeline,
@@ -42,29 +49,29 @@ PRIORS: dict[str, type[DepthPrior]] = {
 
 
 def prior_of(pipe: Any) -> DepthPrior:
-    """The ``DepthPrior`` of a live pipeline: itself, or its adapter in ``PRIORS``; else a ``TypeError``."""
+    """Return the ``DepthPrior`` of a live pipeline: itself or its adapter; ``TypeError`` without one."""
     if isinstance(pipe, DepthDiffusionPipeline):
         return pipe
     for adapter in PRIORS.values():
         if isinstance(pipe, getattr(adapter, "pipeline_class", ())):
             return adapter(pipe)  # type: ignore[call-arg]
     expected = f"a pipeline with an adapter ({', '.join(PRIORS)})"
-    loaded = "Of a hub id or a folder: load_prior(name)."
+    loaded = "Load a hub id or a folder with load_prior(name)."
     written = "docs/how-to/extending.md shows how to write one."
     bad_type("pipe", expected, pipe, loaded if isinstance(pipe, str) else written)
 
 
 @dataclass(frozen=True)
 class PriorSource:
-    """A prior's folder and the ``key`` of its adapter in ``PRIORS``; weights are read by ``load``."""
+    """A prior's folder and the ``key`` of its adapter in ``PRIORS``; ``load`` reads the weights."""
 
     key: str
     layout: Layout
 
     @property
     def licence(self) -> str:
-        """Licence of the weights, from the model card; of a map, that of its model."""
-        return "that of the model which made the map" if self.key == "map" else self.layout.licence
+        """Licence of the weights, from the model card; for a map, the licence of its model."""
+        return "licence of the model that made the map" if self.key == "map" else self.layout.licence
 
     def load(
         self,
@@ -72,13 +79,13 @@ class PriorSource:
         dtype: torch.dtype = torch.float32,
         space: str | None = None,
     ) -> DiffusionPipeline:
-        """The pipeline; arguments and errors as ``load_prior``."""
+        """Load the pipeline; arguments and errors as in ``load_prior``."""
         if space is not None:
             check_choice(space, "space", SPACES)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             bad_value("dtype", "torch.float32, torch.float16 or torch.bfloat16", repr(dtype))
         if device is not None:
-            expected = "one that PyTorch has on this machine"
+            expected = "a PyTorch device of this machine"
             with reading("device", expected, repr(str(device)), "Try 'cpu'."):
                 torch.empty(1, device=device)
         with no_bars() if self.layout.folder == BUNDLED_FOLDER else nullcontext():  # it is small
@@ -88,7 +95,7 @@ class PriorSource:
 
 
 def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> PriorSource:
-    """As ``load_prior``; ``KEY:NAME`` with a key of ``PRIORS`` chooses the adapter."""
+    """Find a prior as in ``load_prior``; ``KEY:NAME`` with a key of ``PRIORS`` selects the adapter."""
     typed = str(name)
     if typed == MAP_LAYOUT.name:
         return PriorSource("map", MAP_LAYOUT)
@@ -96,22 +103,22 @@ def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> Prio
     if rest and key in PRIORS:
         typed = rest
     else:
-        refuse(typed)
+        check_supported(typed)
         key = _recognise(Layout(fetch(typed, hub), typed))
     return PriorSource(key, Layout(fetch(typed, hub, weights=True, variant=variant), typed, variant))
 
 
 def _recognise(layout: Layout) -> str:
-    """Key of the first adapter that recognises the folder."""
+    """Return the key of the first adapter that recognises the folder."""
     for key, adapter in PRIORS.items():
         if adapter.recognises(layout):
             return key
-    cure = f"Known are {', '.join(PRIORS)} (docs/reference/priors.md); --prior bundled always works."
+    hint = f"Supported: {', '.join(PRIORS)} (docs/reference/priors.md); --prior bundled always works."
     if any(layout.folder.glob("*.ckpt")) or any(layout.folder.glob("*.pth")):
-        cure = "A checkpoint becomes such a folder by `geodiff convert SRC DST`."
-    got = ", of no known kind" if layout.index else " without model_index.json"
-    expected = "a folder in diffusers' layout, or of a depth model of transformers"
-    bad_value("prior", expected, f"{layout.folder}{got}", cure)
+        hint = "Convert a checkpoint to such a folder with `geodiff convert SRC DST`."
+    got = ", of unknown type" if layout.index else " without model_index.json"
+    expected = "a folder in diffusers' layout, or with a transformers depth model"
+    bad_value("prior", expected, f"{layout.folder}{got}", hint)
 
 
 def load_prior(
@@ -127,13 +134,14 @@ def load_prior(
         name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``); or ``"map"``, whose call
             takes the ``depth_map`` of another model.
         device: device of the networks, CPU for ``None``.
-        dtype: of the networks.
-        space: what the prior's map is affine in, key of ``SPACES``; by default as the folder says, or depth.
+        dtype: dtype of the networks.
+        space: space in which the prior's map is affine, key of ``SPACES``; by default from the folder, or
+            depth.
         **kwargs: ``variant`` of the weight files (``"fp16"``), and for the download ``revision``, ``token``,
             ``cache_dir``, ``local_files_only``.
 
     Raises:
-        ValueError: it does not exist, is neither cached nor reachable, is refused or of no known kind; its
-            weights do not fit; its space is unknown.
+        ValueError: the prior does not exist, is neither cached nor reachable, or is unsupported or unknown;
+            its weights do not match; its space is unknown.
     """
     return find_prior(name, **kwargs).load(device, dtype, space)

@@ -1,4 +1,4 @@
-"""Small components that the pipelines of this package share: a one-step schedule, a prompt, image sizes."""
+"""Small components shared by this package's pipelines: a one-step scheduler, a prompt, image resizing."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImage
 from diffusers.schedulers.scheduling_utils import SchedulerMixin, SchedulerOutput
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 
 
 class DirectScheduler(SchedulerMixin, ConfigMixin):
-    """One step whose result is the network's output, the clean latent; the network is told ``timestep``."""
+    """One-step scheduler: the network, called with ``timestep``, predicts the clean latent, the result."""
 
     order = 1
     init_noise_sigma = 1.0
@@ -25,10 +25,10 @@ class DirectScheduler(SchedulerMixin, ConfigMixin):
         self.set_timesteps()
 
     def set_timesteps(self, num_inference_steps: int = 1, device: str | torch.device | None = None) -> None:
-        """Start over; any other number of steps than 1 is a ``ValueError``."""
+        """Restart; any other number of steps than 1 is a ``ValueError``."""
         if num_inference_steps != 1:
-            cure = "This prior answers in one step; leave num_inference_steps out."
-            bad_value("num_inference_steps", "1", num_inference_steps, cure)
+            hint = "This prior runs in one step; omit num_inference_steps."
+            bad_value("num_inference_steps", "1", num_inference_steps, hint)
         self.num_inference_steps = num_inference_steps
         self.timesteps = torch.tensor([self.config.timestep], device=device)
 
@@ -40,11 +40,11 @@ class DirectScheduler(SchedulerMixin, ConfigMixin):
         generator: torch.Generator | None = None,
         return_dict: bool = True,
     ) -> SchedulerOutput | tuple[Tensor]:
-        """The clean latent ``(B, C, h, w)``, which is ``model_output``; nothing else is read."""
+        """Return the clean latent ``(B, C, h, w)``, which is ``model_output``; ignores other arguments."""
         return SchedulerOutput(prev_sample=model_output) if return_dict else (model_output,)
 
 
-class SidesOf(MarigoldImageProcessor):
+class ResizeToMultiple(MarigoldImageProcessor):
     """Resizes each side to a multiple of ``side`` pixels, the next (``grow``) or nearest one; never pads."""
 
     def __init__(self, side: int, grow: bool = False) -> None:
@@ -53,7 +53,7 @@ class SidesOf(MarigoldImageProcessor):
 
     @staticmethod
     def pad_image(image: Tensor, align: int) -> tuple[Tensor, tuple[int, int]]:
-        """The image as it is, and no padding."""
+        """Return the image unchanged, and no padding."""
         return image, (0, 0)
 
     def preprocess(
@@ -64,8 +64,8 @@ class SidesOf(MarigoldImageProcessor):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> tuple[Tensor, tuple[int, int], tuple[int, int]]:
-        """As the stock method, but for the size of the processed image ``(N, 3, H, W)``."""
-        # In float32 until the end: not every device resizes in half precision.
+        """Preprocess as the stock method, except for the size of the processed image ``(N, 3, H, W)``."""
+        # Use float32 until the end: not every device resizes in half precision.
         image, padding, size = super().preprocess(image, 0, resample_method_input, device, torch.float32)
         factor = processing_resolution / max(size) if processing_resolution else 1.0
         grid = tuple(self._multiple(length * factor) for length in size)
@@ -79,7 +79,7 @@ class SidesOf(MarigoldImageProcessor):
 
 
 class FixedPrompt(ModelMixin, ConfigMixin):
-    """A text embedding ``(1, length, width)`` that was saved instead of the text encoder that made it."""
+    """A text embedding ``(1, length, width)`` saved in place of its text encoder."""
 
     @register_to_config
     def __init__(self, length: int = 77, width: int = 1024) -> None:
@@ -87,5 +87,5 @@ class FixedPrompt(ModelMixin, ConfigMixin):
         self.embedding = torch.nn.Parameter(torch.zeros(1, length, width), requires_grad=False)
 
     def forward(self) -> Tensor:
-        """The embedding; a call brings it back where it is offloaded."""
+        """Return the embedding; the call brings it back if it is offloaded."""
         return self.embedding

@@ -1,11 +1,10 @@
-"""Weights in their authors' format, made into a folder that ``load_prior`` takes (``geodiff convert``)."""
+"""Converts weights in their authors' format to a folder for ``load_prior`` (``geodiff convert``)."""
 
 from __future__ import annotations
 
 import importlib
 import json
 import os
-import pickle
 import re
 import shutil
 import tempfile
@@ -23,7 +22,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from transformers import Dinov2Config, Dinov2Model
 
-from geodiff_plugin._checks import bad_value, refuse
+from geodiff_plugin._internal.checks import bad_value, raise_input_error
 from geodiff_plugin.priors.components import FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.loading import Layout, check_weights, load_component, reading
@@ -31,7 +30,7 @@ from geodiff_plugin.priors.marigold_v2 import SPACE_OF_CHECKPOINT, MarigoldV2Pip
 from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
 
 _reconstruct = importlib.import_module("numpy._core.multiarray")._reconstruct
-#: A numpy array in a checkpoint is rebuilt by these; files of numpy 1 call the module ``numpy.core``.
+#: Globals that rebuild a numpy array in a checkpoint; files of numpy 1 name the module ``numpy.core``.
 NUMPY_PARTS: list[Any] = [
     (_reconstruct, "numpy.core.multiarray._reconstruct"),
     (_reconstruct, "numpy._core.multiarray._reconstruct"),
@@ -39,32 +38,32 @@ NUMPY_PARTS: list[Any] = [
     np.dtype,
     *(type(np.dtype(name)) for name in ("float16", "float32", "float64", "int64")),
 ]
-#: Keys of an unknown checkpoint that the error names.
+#: Number of keys of an unknown checkpoint that the error lists.
 NAMED_KEYS = 8
-#: What is copied beside weights: configs, vocabularies, licences.
+#: Suffixes of the files copied along with weights: configs, vocabularies, licences.
 COPIED = (".json", ".txt", ".md", ".model", ".safetensors")
 
-#: A copy of runwayml/stable-diffusion-v1-5, which DepthFM's authors name and which is gone.
+#: A copy of runwayml/stable-diffusion-v1-5, which DepthFM's authors reference and which no longer exists.
 VAE_ID = "stable-diffusion-v1-5/stable-diffusion-v1-5"
-#: What diffusers' conversion expects before every name.
+#: Prefix of every name that diffusers' conversion expects.
 LDM_PREFIX = "model.diffusion_model."
 
-#: How the names of the transformer's weights begin in ``ppd.pth``.
+#: Prefix of the transformer's weights in ``ppd.pth``.
 TRANSFORMER = "dit."
-#: The encoder whose tokens it takes, as transformers has it.
+#: Encoder of the transformer's semantic tokens, as published for transformers.
 ENCODER_ID = "depth-anything/Depth-Anything-V2-Large-hf"
 SIZES = ("hidden_size", "num_hidden_layers", "num_attention_heads", "mlp_ratio", "image_size", "patch_size")
 
-#: Name of the prior that ``TRAINABLES`` belong to.
+#: Name of the prior that uses ``TRAINABLES``.
 MARIGOLD_V2 = "marigold-v2"
-#: Its authors' file of the weights that they trained.
+#: The authors' file with the weights that they trained.
 TRAINABLES = "trainables.safetensors"
-#: Their folder of encoded prompts.
+#: The authors' folder of encoded prompts.
 PROMPT_FOLDER = "qwen_text_embeddings"
 #: The prompt for depth in that folder.
 PROMPT = "qwen_edit_2509_qwen_depth_realimg512"
 INDEX = "diffusion_pytorch_model.safetensors.index.json"
-#: What loads the parts that are written, but for the space; they are never in memory together.
+#: Index that loads the written components, without the space; they are never in memory at the same time.
 INDEX_OF_PRIOR: dict[str, Any] = {
     "_class_name": MarigoldV2Pipeline.__name__,
     "_diffusers_version": diffusers_version,
@@ -76,37 +75,37 @@ INDEX_OF_PRIOR: dict[str, Any] = {
     "default_denoising_steps": 1,
     "default_processing_resolution": 768,
 }
-#: Component in the checkpoint -> folder in the base.
+#: Folder in the base by component name in the checkpoint.
 FOLDERS = {"Diffuser": "transformer", "VAE": "vae"}
-#: Names in the checkpoint -> those in the base, of a LoRA's factors with ``" A"`` or ``" B"`` behind.
+#: Patterns from names in the checkpoint to names in the base; LoRA factors get a suffix ``" A"`` or ``" B"``.
 NAMES = ((r"\.base_layer\.", "."), (r"\.lora_([AB])(\.default)?\.weight$", r".weight \1"))
 
 
 def convert_prior(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> str:
-    """Convert a checkpoint into a folder that appears whole or not at all; the kind that it was.
+    """Convert a checkpoint to a folder, atomically, and return its type.
 
     Args:
         paths: ``SRC DST``, or ``marigold-v2 BASE CHECKPOINT DST``.
-        part: the file, folder or hub id of what the checkpoint lacks.
-        space: what the map of ``marigold-v2`` is affine in, where its folder's name does not say.
+        part: file, folder or hub id of components that the checkpoint lacks.
+        space: space in which the map of ``marigold-v2`` is affine, if its folder's name does not state it.
 
     Raises:
-        InputError: no checkpoint of a known kind, or a ``DST`` that exists.
+        InputError: unknown checkpoint type, or an existing ``DST``.
     """
     layered = len(paths) == 4 and str(paths[0]) == MARIGOLD_V2
     if not layered and len(paths) != 2:
         got = " ".join(map(str, paths)) or "none"
-        refuse(f"Give two paths, SRC DST, or {MARIGOLD_V2} BASE CHECKPOINT DST; got {got}.")
+        raise_input_error(f"Pass two paths, SRC DST, or {MARIGOLD_V2} BASE CHECKPOINT DST; got {got}.")
     if not layered and space:
-        refuse(f"--space is for {MARIGOLD_V2} alone: leave it out for {paths[0]}.")
+        raise_input_error(f"--space applies to {MARIGOLD_V2} only: omit it for {paths[0]}.")
     source, target = paths[-2:]
     if os.path.lexists(target):
-        bad_value("DST", "a folder that does not exist yet", target, "Name another, or remove it first.")
+        bad_value("DST", "a folder that does not exist yet", target, "Choose another or remove it.")
     try:
         unfinished = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     except OSError as error:
-        cure = f"Name another, or make the folder {target.parent} first."
-        bad_value("DST", "a folder that can be made", f"{target} ({error.strerror})", cure)
+        hint = f"Choose another path, or create the folder {target.parent} first."
+        bad_value("DST", "a folder that can be created", f"{target} ({error.strerror})", hint)
     kind = MARIGOLD_V2 if layered else "folder"
     try:
         if layered:
@@ -115,78 +114,78 @@ def convert_prior(paths: Sequence[Path], part: str | None = None, space: str | N
             _convert_folder(source, unfinished)
         else:
             kind = _convert_file(source, unfinished, part)
-        unfinished.chmod(0o755)  # mkdtemp's is its owner's alone
+        unfinished.chmod(0o755)  # mkdtemp's folder is readable by its owner only
         os.replace(unfinished, target)
-    except (KeyError, RuntimeError, AttributeError, TypeError) as error:  # of networks that it does not fit
+    except (KeyError, RuntimeError, AttributeError, TypeError) as error:  # checkpoint and network differ
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        bad_value("SRC", "a whole checkpoint of its kind", f"{source} ({reason})", "Fetch it anew.")
+        bad_value("SRC", "a complete checkpoint of its type", f"{source} ({reason})", "Download it again.")
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     return kind
 
 
 def _read_checkpoint(path: Path, kind: type[Any] = Mapping) -> Any:
-    """What ``torch.save`` put into a file, on the CPU: a mapping, or a ``kind``; nothing in it is run."""
+    """Read a file written by ``torch.save`` on the CPU: a mapping, or a ``kind``; no code in it is run."""
     if not os.path.isfile(path):
         bad_value("SRC", "a checkpoint file or a folder in diffusers' layout", path, "Check the path.")
     try:
         with torch.serialization.safe_globals(NUMPY_PARTS):
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, ValueError, OSError) as error:
-        got = "one that cannot be read (is it cut off?)"  # torch's own advice may be to run its code
-        cure = "Fetch it anew and compare its size with the original's."
+    except Exception as error:  # any type: other bytes are interpreted as instructions
+        got = "an unreadable file (truncated?)"  # torch's own advice may be to run its code
+        hint = "Download it again and compare its size with the original's."
         if "GLOBAL" in str(error) or "Unsupported class" in str(error):
-            got = "one that cannot be read (it holds more than tensors, numbers and text)"
-            cure = "Unpickling it would run code, which is never done: ask its authors for safetensors."
-        bad_value(str(path), "a checkpoint written by torch.save", got, cure)
+            got = "an unreadable file (it contains more than tensors, numbers and text)"
+            hint = "Unpickling it would run code, which is never done. Ask its authors for safetensors."
+        bad_value(str(path), "a checkpoint written by torch.save", got, hint)
     if not isinstance(content, kind):
-        bad_value(str(path), f"a checkpoint that holds a {kind.__name__.lower()}", type(content).__name__)
+        bad_value(str(path), f"a checkpoint with a {kind.__name__.lower()}", type(content).__name__)
     return content
 
 
 def _part(state: Mapping[Any, Any], prefix: str) -> dict[str, Any]:
-    """The weights whose names start with ``prefix``, without it."""
+    """Return the weights whose names start with ``prefix``, without it."""
     named = ((str(key), value) for key, value in state.items())
     return {key.removeprefix(prefix): value for key, value in named if key.startswith(prefix)}
 
 
 def _save_weights(state: Mapping[str, Tensor], path: Path) -> None:
-    """Write safetensors, which refuse tensors that share memory (tied weights) or have gaps."""
-    apart = {name: value.clone(memory_format=torch.contiguous_format) for name, value in state.items()}
-    save_file(apart, path, metadata={"format": "pt"})
+    """Write safetensors, which reject tensors that share memory (tied weights) or have gaps."""
+    contiguous = {name: value.clone(memory_format=torch.contiguous_format) for name, value in state.items()}
+    save_file(contiguous, path, metadata={"format": "pt"})
 
 
 def _fixed_prompt(embedding: Tensor) -> FixedPrompt:
-    """The component that holds a prompt's embedding ``(1, n, C)``."""
+    """Create the component with a prompt's embedding ``(1, n, C)``."""
     prompt = FixedPrompt(*embedding.shape[1:])
     prompt.load_state_dict({"embedding": embedding.float()})
     return prompt
 
 
 def _write_card(folder: Path, licence: str, text: str) -> None:
-    """``README.md``: the licence where it is looked for on load, and where the weights come from."""
+    """Write ``README.md`` with the licence, which is read on load, and the origin of the weights."""
     (folder / "README.md").write_text(f"---\nlicense: {licence}\n---\n\n{text}\n", encoding="utf-8")
 
 
-# A folder with .bin files
+# Folders with .bin files
 
 
 def _safe_name(name: str) -> str:
-    """Of ``pytorch_model.bin`` (transformers) or ``diffusion_pytorch_model.bin`` (diffusers), or a shard."""
+    """Convert the name ``pytorch_model.bin`` (transformers; diffusers has a prefix) or a shard's name."""
     name = name.replace(".bin", ".safetensors")
     return name.replace("pytorch_model", "model") if name.startswith("pytorch_model") else name
 
 
 def _convert_folder(source: Path, folder: Path) -> None:
-    """Write the same folder, of one component or several, with safetensors in place of ``.bin`` files."""
+    """Write the same folder, with one or several components, with safetensors in place of ``.bin`` files."""
     if not any(source.rglob("*.bin")):
-        refuse(f"The folder {source} has no .bin weights to convert: give it to --prior as it is.")
+        raise_input_error(f"The folder {source} has no .bin weights to convert: pass it to --prior.")
     for path in sorted(p for p in source.rglob("*") if p.is_file()):
         target = folder / path.relative_to(source)
         safe = target.with_name(_safe_name(path.name))
         target.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".bin":
-            if not (source / safe.relative_to(folder)).is_file():  # else it is copied
+            if not (source / safe.relative_to(folder)).is_file():  # otherwise it is copied
                 _save_weights(_read_checkpoint(path), safe)
         elif path.name.endswith(".bin.index.json"):
             index = json.loads(path.read_text(encoding="utf-8"))
@@ -200,7 +199,7 @@ def _convert_folder(source: Path, folder: Path) -> None:
 
 
 def unet_config(hparams: Mapping[str, Any]) -> dict[str, Any]:
-    """Config of ``UNet2DConditionModel`` for the options of a CompVis ``UNetModel``."""
+    """Return the ``UNet2DConditionModel`` config for the options of a CompVis ``UNetModel``."""
     width, mults = hparams["model_channels"], hparams["channel_mult"]
     attends = [2**level in set(hparams["attention_resolutions"]) for level in range(len(mults))]
     kinds = ["CrossAttn" if attending else "" for attending in attends]
@@ -211,7 +210,7 @@ def unet_config(hparams: Mapping[str, Any]) -> dict[str, Any]:
         "cross_attention_dim": hparams["context_dim"],
         "block_out_channels": tuple(width * mult for mult in mults),
         "use_linear_projection": hparams.get("use_linear_in_transformer", False),
-        # diffusers' name for the number of heads, for reasons of its history.
+        # diffusers' historical name for the number of heads.
         "attention_head_dim": hparams["num_heads"],
         "down_block_types": tuple(f"{kind}DownBlock2D" for kind in kinds),
         "up_block_types": tuple(f"{kind}UpBlock2D" for kind in reversed(kinds)),
@@ -231,7 +230,7 @@ def _write_depthfm(checkpoint: Mapping[str, Any], folder: Path, part: str | None
     source = part or VAE_ID
     expected = "a folder or hub id of Stable Diffusion 1.5, or of its VAE (the checkpoint has none)"
     subfolder = "" if (Path(source) / "config.json").is_file() else "vae"
-    with reading("--with", expected, repr(source), f"Fetch it once: hf download {VAE_ID}."):
+    with reading("--with", expected, repr(source), f"Download it once: hf download {VAE_ID}."):
         vae = AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
     embedding = torch.as_tensor(checkpoint["empty_text_embedding"])
     prompt = _fixed_prompt(embedding.reshape(1, *embedding.shape[-2:]))
@@ -240,7 +239,7 @@ def _write_depthfm(checkpoint: Mapping[str, Any], folder: Path, part: str | None
     _write_card(
         folder,
         "mit",
-        "DepthFM (CompVis/depth-fm), converted by `geodiff convert`. The VAE is that of Stable Diffusion 1.5 "
+        "DepthFM (CompVis/depth-fm), converted by `geodiff convert`. The VAE is Stable Diffusion 1.5's "
         "and the U-Net was fine-tuned from it, so its CreativeML Open RAIL-M licence applies as well.",
     )
 
@@ -249,26 +248,27 @@ def _write_depthfm(checkpoint: Mapping[str, Any], folder: Path, part: str | None
 
 
 def _load_encoder(part: str | None) -> Dinov2Model:
-    """The encoder out of the folder that ``--with`` names, every weight in its place."""
+    """Load the encoder from the folder of ``--with``, checking every weight."""
     source = Path(part or "")
     config, weights = source / "config.json", source / "model.safetensors"
-    expected = f"a folder of {ENCODER_ID}: the encoder whose tokens ppd.pth needs"
-    cure = f"Fetch it once: hf download {ENCODER_ID} --local-dir da2. ppd_moge.pth needs another."
+    expected = f"a folder of {ENCODER_ID}, the encoder that ppd.pth needs"
+    hint = f"Download it once: hf download {ENCODER_ID} --local-dir da2. ppd_moge.pth needs another one."
     if not (config.is_file() and weights.is_file()):
-        bad_value("--with", expected, part or "nothing", cure)
-    with reading("--with", expected, str(source), cure):
+        bad_value("--with", expected, part or "nothing", hint)
+    with reading("--with", expected, str(source), hint):
         backbone = json.loads(config.read_text(encoding="utf-8"))["backbone_config"]
         sizes = {name: backbone[name] for name in SIZES if name in backbone}
         state = _part(load_file(weights), "backbone.")
     with tempfile.TemporaryDirectory() as folder:
-        # Through a file: transformers renames on loading, and which names are its own differs by its version.
+        # Loaded through a file: transformers renames weights on loading, and its own names depend on its
+        # version.
         _save_weights({name: v.float() for name, v in state.items()}, Path(folder) / "model.safetensors")
         Dinov2Config(**sizes, architectures=["Dinov2Model"]).save_pretrained(folder)
         return load_component(Layout(Path(folder), str(source)), "", Dinov2Model, torch.float32)
 
 
 def _load_transformer(state: Mapping[str, Tensor]) -> PixelDiT:
-    """The transformer, of the size that its weights have."""
+    """Load the transformer with the size of its weights."""
     width, _, side, _ = state["x_embedder.proj.weight"].shape
     head_size = state["blocks.0.attn.q_norm.weight"].shape[0]
     fusion = state["proj_fusion.0.weight"].shape[1]
@@ -284,7 +284,7 @@ def _load_transformer(state: Mapping[str, Tensor]) -> PixelDiT:
 def _write_ppd(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
     dit, encoder = _load_transformer(_part(checkpoint, TRANSFORMER)), _load_encoder(part)
     if encoder.config.hidden_size != dit.config.semantic_size:
-        expected = f"{dit.config.semantic_size} wide, as the checkpoint's tokens"
+        expected = f"{dit.config.semantic_size} wide, like the checkpoint's tokens"
         got = f"{encoder.config.hidden_size} wide, another size of Depth Anything V2"
         bad_value("the encoder of --with", expected, got)
     PPDPipeline(dit, encoder, FlowMatchEulerDiscreteScheduler()).save_pretrained(folder)
@@ -297,7 +297,8 @@ def _write_ppd(checkpoint: Mapping[str, Any], folder: Path, part: str | None) ->
 
 
 PPD_KEYS = ("x_embedder.proj", "blocks.0.attn.q_norm", "blocks.0.mlp.fc1", "proj_fusion.0")
-#: Kind -> the keys that tell it, and what fills an empty folder; the last argument is that of ``--with``.
+#: By type: the keys that identify it, and the function that fills an empty folder; its last argument is
+#: ``--with``.
 CONVERTERS: dict[str, tuple[set[str], Any]] = {
     "depthfm": ({"state_dict", "ldm_hparams", "noising_step", "empty_text_embedding"}, _write_depthfm),
     "ppd": ({f"{TRANSFORMER}{name}.weight" for name in PPD_KEYS}, _write_ppd),
@@ -305,31 +306,31 @@ CONVERTERS: dict[str, tuple[set[str], Any]] = {
 
 
 def _convert_file(source: Path, folder: Path, part: str | None) -> str:
-    """Convert a checkpoint into an empty folder; what kind it was."""
+    """Convert a checkpoint into an empty folder and return its type."""
     checkpoint = _read_checkpoint(source)
     for kind, (keys, write) in CONVERTERS.items():
         if set(checkpoint) >= keys:
             write(checkpoint, folder, part)
             return kind
-    got = f"{source} with the keys {', '.join(map(str, list(checkpoint)[:NAMED_KEYS])) or 'of nothing'}"
-    cure = "docs/reference/priors.md tells which prior comes from where."
-    bad_value("SRC", f"a checkpoint of a known kind ({', '.join(CONVERTERS)})", got, cure)
+    got = f"{source} with the keys {', '.join(map(str, list(checkpoint)[:NAMED_KEYS])) or '(none)'}"
+    hint = "docs/reference/priors.md lists the source of each prior."
+    bad_value("SRC", f"a checkpoint of a known type ({', '.join(CONVERTERS)})", got, hint)
 
 
 # Marigold V2 (arXiv 2609.08084): base, trained checkpoint and prompt
 
 
 def merged(name: str, weight: Tensor, trained: Mapping[str, Tensor]) -> Tensor:
-    """A weight of the base with what was trained: in its place, or added to it in float32."""
+    """Merge trained weights into a base weight: replaced, or with the LoRA product added in float32."""
     weight = trained.get(name, weight).to(weight.dtype)
     if f"{name} A" not in trained:
         return weight
-    # Alpha is the rank in every published configuration, so the product of the factors counts once.
+    # Alpha equals the rank in every published configuration, so the product of the factors has weight 1.
     return (weight.float() + trained[f"{name} B"].float() @ trained[f"{name} A"].float()).to(weight.dtype)
 
 
 def _trained(state: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    """What was trained of a component, by its names in the base."""
+    """Return the trained weights of a component by their names in the base."""
     result = {}
     for name, value in _part(state, f"{part}.").items():
         for pattern, replacement in NAMES:
@@ -339,7 +340,7 @@ def _trained(state: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
 
 
 def _base_files(base: Path, name: str) -> tuple[list[Path], set[str]]:
-    """The safetensors of a component of the base, and the names of their tensors."""
+    """Return the safetensors files of a base component and the names of their tensors."""
     folder = base / name
     if not os.path.isfile(folder / "config.json"):
         bad_value("BASE", f"a folder of Qwen/Qwen-Image-Edit-2509 with {name}/", base, "Check the path.")
@@ -348,8 +349,8 @@ def _base_files(base: Path, name: str) -> tuple[list[Path], set[str]]:
         names = set(json.loads((folder / INDEX).read_text("utf-8"))["weight_map"].values())
     files, tensors = [folder / file for file in sorted(names)], set[str]()
     if not files or not all(file.is_file() for file in files):
-        got = f"one without all of {', '.join(sorted(names)) or 'them'}"
-        bad_value("BASE", f"a folder with safetensors in {folder}", got, "Fetch it anew.")
+        got = f"a folder without some of {', '.join(sorted(names)) or 'them'}"
+        bad_value("BASE", f"a folder with safetensors in {folder}", got, "Download it again.")
     for file in files:
         with safe_open(file, "pt") as opened:
             tensors |= set(opened.keys())
@@ -357,19 +358,19 @@ def _base_files(base: Path, name: str) -> tuple[list[Path], set[str]]:
 
 
 def _read_prompt(file: Path, requested: str | None) -> Tensor:
-    """The first prompt ``(1, n, C)`` of a folder as requested, or as in the authors' download, unpadded."""
-    beside = [parent / PROMPT_FOLDER for parent in file.resolve().parents]
-    for folder in beside if requested is None else [Path(requested)]:
+    """Read the first prompt ``(1, n, C)``, unpadded, from the requested folder or the authors' download."""
+    candidates = [parent / PROMPT_FOLDER for parent in file.resolve().parents]
+    for folder in candidates if requested is None else [Path(requested)]:
         if folder.is_dir():
             files = (folder / f"{PROMPT}_prompt_{part}.pt" for part in ("embeds", "mask"))
             embedding, mask = (_read_checkpoint(file, Tensor) for file in files)
             return embedding[:1, mask[0] > 0]
     expected = f"the folder {PROMPT_FOLDER} of huawei-bayerlab/marigold-v2-0"
-    bad_value("--with", expected, requested or "none beside", f"Name it: --with .../{PROMPT_FOLDER}")
+    bad_value("--with", expected, requested or "none found", f"Pass it: --with .../{PROMPT_FOLDER}")
 
 
 def _merge_into_base(base: Path, file: Path, folder: Path) -> None:
-    """Write the networks of the base with the trained weights and factors of a file; checked before."""
+    """Write the base's networks with the trained weights and factors of a file, after checking them."""
     state = load_file(file)
     trained = {part: _trained(state, part) for part in FOLDERS}
     sources = {}
@@ -380,7 +381,7 @@ def _merge_into_base(base: Path, file: Path, folder: Path) -> None:
         missing = [f"{key[:-2]} of factor {key[-1]}" for key in factors - known.keys()]
         check_weights(missing, {key.partition(" ")[0] for key in known} - tensors, str(file))
     if not any(key.endswith(" A") for key in trained["Diffuser"]):
-        bad_value(str(file), "a checkpoint of Marigold V2 with a LoRA (Diffuser.*.lora_A.*)", "one without")
+        bad_value(str(file), "a checkpoint of Marigold V2 with a LoRA (Diffuser.*.lora_A.*)", "no LoRA")
     for part, name in FOLDERS.items():
         (folder / name).mkdir(parents=True)
         for copied in ("config.json", INDEX):
@@ -394,7 +395,7 @@ def _merge_into_base(base: Path, file: Path, folder: Path) -> None:
 def _convert_marigold_v2(
     base: Path, checkpoint: Path, folder: Path, prompts: str | None, space: str | None
 ) -> None:
-    """Write the folder of a prior of ``transformer/`` and ``vae/`` of the base, file by file in memory."""
+    """Write a prior's folder from ``transformer/`` and ``vae/`` of the base, file by file to save memory."""
     file = checkpoint / TRAINABLES if os.path.isdir(checkpoint) else checkpoint
     if not os.path.isfile(file) or file.suffix != ".safetensors":
         expected = f"a folder of huawei-bayerlab/marigold-v2-0 with {TRAINABLES}, such as depth/Log-stage2"
@@ -402,8 +403,8 @@ def _convert_marigold_v2(
     prompt, trained_as = _read_prompt(file, prompts), file.resolve().parent.name
     space = space or SPACE_OF_CHECKPOINT.get(trained_as.split("-")[0].lower())
     if space is None:
-        cure = "Keep the authors' folder name, or say with --space what its map is affine in."
-        bad_value("CHECKPOINT", "in a folder called Log-*, Uniform-* or Disparity-*", repr(trained_as), cure)
+        hint = "Keep the authors' folder name, or pass the space of its map with --space."
+        bad_value("CHECKPOINT", "in a folder called Log-*, Uniform-* or Disparity-*", repr(trained_as), hint)
     _merge_into_base(base, file, folder)
     dtype = prompt.dtype if prompt.is_floating_point() else torch.float32
     _fixed_prompt(prompt).to(dtype).save_pretrained(folder / "prompt")

@@ -14,12 +14,12 @@ from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
 
-#: The timestep that the network is always told.
+#: The fixed timestep input of the network.
 TIMESTEP = 1
 
 
 class FourierBlock(nn.Module):
-    """Features mended in their Fourier magnitude and angle and in space; named as the published weights."""
+    """Enhances features in Fourier magnitude, Fourier angle and space; named like the published weights."""
 
     def __init__(self, channels: int, groups: int = 8) -> None:
         super().__init__()
@@ -34,16 +34,16 @@ class FourierBlock(nn.Module):
         self.act = nn.SiLU()
 
     def forward(self, features: Tensor) -> Tensor:
-        """``(B, C, h, w)`` to the same shape and dtype."""
+        """Transform ``(B, C, h, w)`` to the same shape and dtype."""
         features = self.norm(features)
         start = self.act(self.conv_f1(features))
-        # There is no half precision FFT for sizes that are no power of two.
+        # Half-precision FFTs support only sizes that are powers of two.
         spectrum = torch.fft.rfft2(start.float(), norm="ortho")  # (B, C, h, w // 2 + 1)
         magnitude = self.act(self.conv_f2(spectrum.abs().to(start.dtype)))
         angle = self.act(self.conv_f4(spectrum.angle().to(start.dtype))).float()
-        mended = torch.complex(magnitude * torch.cos(angle), magnitude * torch.sin(angle))
-        mended = torch.fft.irfft2(mended, s=start.shape[-2:], norm="ortho").to(start.dtype)
-        in_frequency = self.conv_f3(mended + start)
+        enhanced = torch.complex(magnitude * torch.cos(angle), magnitude * torch.sin(angle))
+        enhanced = torch.fft.irfft2(enhanced, s=start.shape[-2:], norm="ortho").to(start.dtype)
+        in_frequency = self.conv_f3(enhanced + start)
         in_space = self.conv_s2(self.act(self.conv_s1(features))) + features
         return self.fuse(torch.cat([in_space, in_frequency], dim=1))
 
@@ -51,7 +51,7 @@ class FourierBlock(nn.Module):
 class FourierUNet(UNet2DConditionModel):
     """``UNet2DConditionModel`` whose middle block is followed by a ``FourierBlock`` named ``fftblock``."""
 
-    # The wraps keeps the signature, from which diffusers reads what a config may hold.
+    # The wrapper keeps the signature, from which diffusers reads the allowed config entries.
     @functools.wraps(UNet2DConditionModel.__init__)  # type: ignore[misc]
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -81,7 +81,7 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
         default_processing_resolution: int = 768,
     ) -> None:
         super().__init__()
-        # Not a component: the authors' folders have none, and ours are like theirs.
+        # Not a component: the authors' folders have no scheduler, and converted ones match them.
         self.scheduler = DirectScheduler(TIMESTEP)
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
         modules = {"unet": unet, "vae": vae, "text_encoder": text_encoder, "tokenizer": tokenizer}
@@ -89,7 +89,7 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """Four channels in, no class embedding, a text encoder, no scheduler among the components."""
+        """Recognise 4 input channels, no class embedding, a text encoder, and no scheduler component."""
         unet = layout.config("unet")
         return (
             unet.get("in_channels") == 4
@@ -101,10 +101,10 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
-        """Mode of the image latent's posterior, and the empty prompt."""
+        """Return the mode of the image latent's posterior, and the empty prompt."""
         latent = self.image_latents(image, ensemble_size, batch_size)  # (N * E, 4, h, w)
         return {"image_latent": latent, "prompt": self.prompt_embedding(latent)}
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The clean depth latent; ``latents`` are not looked at."""
+        """Predict the clean depth latent; ``latents`` are ignored."""
         return self.run_unet(condition["image_latent"], timestep, condition)

@@ -1,4 +1,4 @@
-"""GeoWizard v1 and v2: depth and normals from one noise (Fu et al., ECCV 2024)."""
+"""GeoWizard v1 and v2: depth and normals from the same noise (Fu et al., ECCV 2024)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjection
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
-from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin._internal.checks import bad_value, check_choice
 from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
-from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, stretched
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, normalized
 
 DOMAINS = ("indoor", "outdoor", "object")
-#: Width of the class embedding of a U-Net whose further condition is the image (v1).
+#: Width of the class embedding of a U-Net that is also conditioned on the image (v1).
 IMAGE_EMBEDDING = 10
-#: The same of one whose further condition is the domain as text (v2).
+#: Width of the class embedding of a U-Net that is also conditioned on the domain as text (v2).
 TEXT_PROMPT = 4
 #: The authors' subfolder of the second version.
 UNET_V2 = "unet_v2"
@@ -28,10 +28,10 @@ EPS_LENGTH = 1e-5
 
 
 class PairAttention(AttnProcessor2_0):
-    """Self-attention over both members of a pair: every token sees those of its depth and of its normals."""
+    """Self-attention over both members of a pair: every token attends to depth and normal tokens."""
 
     def __call__(self, attn: Attention, hidden_states: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-        """Tokens ``(2B, n, c)``, all depth before all normals, attended to as ``(B, 2n, c)``."""
+        """Attend to tokens ``(2B, n, c)``, all depth before all normals, as ``(B, 2n, c)``."""
         pair = torch.cat(hidden_states.chunk(2), dim=1)
         return torch.cat(super().__call__(attn, pair, *args, **kwargs).chunk(2, dim=1))
 
@@ -39,12 +39,12 @@ class PairAttention(AttnProcessor2_0):
 class GeoWizardPipeline(DepthDiffusionPipeline):
     """GeoWizard v1 (conditioned on the image through CLIP) and v2 (on the domain as text).
 
-    Guidance touches the depth half alone.
+    Guidance changes only the depth half.
 
     Convention:
-        Normals are unit vectors of the left camera's frame (x right, y down, z forward) on the side of the
-        surface that the camera sees: a wall that faces the camera has ``(0, 0, -1)``. GeoWizard's own files
-        hold the opposite vectors. They are resized by taking the nearest one, which keeps their length.
+        Normals are unit vectors in the left camera's frame (x right, y down, z forward) on the visible side
+        of the surface: a wall facing the camera has ``(0, 0, -1)``. GeoWizard's own files contain the
+        opposite vectors. They are resized with nearest-neighbour sampling, which keeps their length.
     """
 
     depth_channels = slice(0, 4)
@@ -80,9 +80,9 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """A U-Net from 8 to 4 channels with a class embedding of 10 numbers (v1) or of 4 (v2).
+        """Recognise a U-Net from 8 to 4 channels with a class embedding of width 10 (v1) or 4 (v2).
 
-        So is that of a Lotus-G; of v2 the name of the subfolder or the domain that we save must tell, too.
+        A Lotus-G has the latter too, so v2 also needs its subfolder's name or the saved domain.
         """
         unet = layout.config(_unet_folder(layout))
         if (unet.get("in_channels"), unet.get("out_channels")) != (8, 4):
@@ -93,7 +93,7 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> GeoWizardPipeline:
-        """From our folder or the authors', whose v2 holds ``unet_v2`` and parts of Stable Diffusion 2."""
+        """Load this package's folder or the authors', whose v2 has ``unet_v2`` and parts of SD 2."""
         unet = None
         if _unet_folder(layout) == UNET_V2:
             unet = load_component(layout, UNET_V2, UNet2DConditionModel, dtype)
@@ -107,9 +107,9 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         generator: Generators,
         domain: str | None = None,
     ) -> Condition:
-        """Latent, prompt, and labels ``(N * E, 2, 10 or 4)`` of both halves; ``domain`` of ``DOMAINS``."""
+        """Return latent, prompt and labels ``(N * E, 2, 10 or 4)`` of both halves."""
         domain = check_choice(domain or self.config.default_domain, "domain", DOMAINS)
-        couple_pairs(self.unet)  # again: under other processors depth and normals do not see each other
+        couple_pairs(self.unet)  # again: with other processors depth and normals are decoupled
         of_image = self.unet.config.projection_class_embeddings_input_dim == IMAGE_EMBEDDING
         prompt = self._image_prompt(image) if of_image else self.prompt_embedding(image, f"{domain} geometry")
         labels = class_embedding(domain if of_image else None).to(image)
@@ -120,7 +120,7 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         }
 
     def _image_prompt(self, image: Tensor) -> Tensor:
-        """CLIP's embedding of the whole image squeezed into its square, ``(N, 1, width)``."""
+        """Compute CLIP's embedding of the whole image resized to its square, ``(N, 1, width)``."""
         size = (self.image_encoder.config.image_size,) * 2
         statistics = OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
         mean, std = (image.new_tensor(v, dtype=torch.float32)[:, None, None] for v in statistics)
@@ -130,11 +130,11 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         return embeds[:, None].to(image.dtype)
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """One Gaussian for depth and normals, ``(N * E, 8, h, w)``."""
+        """Draw the same Gaussian noise for depth and normals, ``(N * E, 8, h, w)``."""
         return super().prepare_latents(condition, generator).repeat(1, 2, 1, 1)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The U-Net's answer for both halves, ``(B, 8, h, w)``."""
+        """Run the U-Net on both halves, ``(B, 8, h, w)``."""
         geometry = torch.cat([latents[:, self.depth_channels], latents[:, self.normal_channels]])
         of_pairs = {
             "prompt": condition["prompt"].repeat(2, 1, 1),
@@ -145,19 +145,19 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         return torch.cat(output.chunk(2), dim=1)
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
-        """Their ending: clipped, then stretched so that every map has a 0 and a 1."""
-        return stretched(super().decode_prediction(latents))
+        """Decode like the authors: clipped, then normalized so that every map spans [0, 1]."""
+        return normalized(super().decode_prediction(latents))
 
     def decode_extras(self, latents: Tensor, ensemble_size: int) -> dict[str, Tensor]:
-        """``{"normals": (N, 3, H, W)}`` of every image: those of the member closest to the mean of all."""
+        """Decode ``{"normals": (N, 3, H, W)}`` of every image: the member closest to the mean of all."""
         halves = latents[:, self.normal_channels].split(1)
-        normals = torch.cat([self.decode_picture(half) for half in halves])
+        normals = torch.cat([self.decode_image(half) for half in halves])
         normals = normals / (normals.norm(dim=1, keepdim=True) + EPS_LENGTH)
         return {"normals": torch.cat([closest_to_mean(m) for m in normals.split(ensemble_size)])}
 
 
 def class_embedding(domain: str | None) -> Tensor:
-    """Sines and cosines of one-hot codes, ``(2, 10)``, ``(2, 4)`` without a domain; depth, then normals."""
+    """Embed one-hot codes of depth and normals as sines and cosines, ``(2, 10)`` or ``(2, 4)``."""
     here: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
     codes = [torch.tensor([[0.0, 1.0], [1.0, 0.0]], **here)]
     if domain is not None:
@@ -166,19 +166,19 @@ def class_embedding(domain: str | None) -> Tensor:
 
 
 def closest_to_mean(normals: Tensor) -> Tensor:
-    """The member of ``(E, 3, H, W)`` unit vectors that turns least from their mean, ``(1, 3, H, W)``."""
+    """Return the member of unit vectors ``(E, 3, H, W)`` closest in angle to their mean, ``(1, 3, H, W)``."""
     mean = F.normalize(normals.mean(dim=0, keepdim=True), dim=1)
     angle = torch.acos((normals * mean).sum(dim=1).clamp(-1.0, 1.0)).sum(dim=(1, 2))  # (E,)
     return normals[angle.argmin()][None]
 
 
 def couple_pairs(unet: UNet2DConditionModel) -> None:
-    """Let every self-attention of the transformer blocks see the pair; it has no weights of its own."""
+    """Let every self-attention of the transformer blocks attend to the pair; it has no weights of its own."""
     names = (name for name in unet.attn_processors if name.endswith("attn1.processor"))
     unet.set_attn_processor(unet.attn_processors | dict.fromkeys(names, PairAttention()))
 
 
 def _unet_folder(layout: Layout) -> str:
-    """The authors' folder of v2 where it is the only one."""
+    """Return the authors' folder of v2 if it is the only U-Net folder."""
     both = ((layout.folder / name).exists() for name in ("unet", UNET_V2))
     return UNET_V2 if tuple(both) == (False, True) else "unet"

@@ -1,4 +1,4 @@
-"""From a name, a path or a hub id to a pipeline whose weights were checked one by one."""
+"""Loads a pipeline from a name, a path or a hub id, and checks its weights one by one."""
 
 from __future__ import annotations
 
@@ -23,48 +23,48 @@ from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_b
 from transformers.utils import logging as transformers_logging
 from yaml import YAMLError
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.priors import components
 
-#: Hosts with a switch for their progress bars.
+#: Libraries with a switch for their progress bars.
 HOSTS = (diffusers_logging, transformers_logging)
 BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
 
-#: Priors that people ask for and that cannot be run: pattern of the last part of the name -> reason.
-REFUSED = {
+#: Requested priors that cannot be run: pattern of the last part of the name -> reason.
+UNSUPPORTED = {
     r"apdepth": "its U-Net takes the depth of a Depth Anything V2 Giant, whose weights were never released",
-    r"lotus-?2": "it is a LoRA on FLUX.1-dev, which is gated and needs some 40 GB; Lotus v1 and v2 work",
-    r"marigold.*-hr\b.*": "no code that runs it was published; marigold-depth-v1-1 takes any resolution",
-    r"geowizard-e2e-ft": "it needs GeoWizard's networks with another start; take marigold-e2e-ft-depth",
-    r"diffusion-?depth|ddp": "its toolchain of 2023 (torch 1.10, mmseg) cannot be installed any more",
-    r"(lotus|.*e2e-ft)-normals?.*": "it predicts normals; take its sibling for depth",
+    r"lotus-?2": "it is a LoRA on FLUX.1-dev, which is gated and needs about 40 GB; Lotus v1 and v2 work",
+    r"marigold.*-hr\b.*": "no code for it was published; marigold-depth-v1-1 supports any resolution",
+    r"geowizard-e2e-ft": "it needs GeoWizard's networks initialized differently; use marigold-e2e-ft-depth",
+    r"diffusion-?depth|ddp": "its toolchain of 2023 (torch 1.10, mmseg) can no longer be installed",
+    r"(lotus|.*e2e-ft)-normals?.*": "it predicts normals; use the corresponding depth model",
 }
 SMALL_FILES = ["*.json", "*.txt", "*.md"]
 WEIGHTS = ["*/*.safetensors", "model*.safetensors"]
-#: Second copies of the same weights, which only ``variant`` asks for.
+#: Duplicates of the same weights, which are only loaded with ``variant``.
 OTHER_VARIANTS = ["*.fp16.*safetensors", "*.bf16.*safetensors", "*.fp16-*.safetensors", "*non_ema*"]
-#: What ``model_index.json`` may name: the two hosts, and the small components of this package.
+#: Libraries that ``model_index.json`` may name: diffusers, transformers, and this package's components.
 LIBRARIES = {"diffusers": diffusers, "transformers": transformers, components.__name__: components}
 
-CURE = "Is a file of it cut off, or of another version? Save or fetch the folder anew."
+HINT = "A file may be truncated or from another version. Save or download the folder again."
 
 
 @contextmanager
-def reading(what: str, expected: str, got: str, cure: str) -> Iterator[None]:
-    """Turn what a library raises over a bad file into the sentence of ``bad_value``, with its first line."""
+def reading(what: str, expected: str, got: str, hint: str) -> Iterator[None]:
+    """Convert a library's exception about a bad file to the message of ``bad_value``, with its first line."""
     try:
         yield
-    except Exception as error:  # libraries raise nearly everything
+    except Exception as error:  # libraries raise nearly every type
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = lines[0] if lines else type(error).__name__
     else:
         return
-    bad_value(what, expected, f"{got} ({reason})", cure)
+    bad_value(what, expected, f"{got} ({reason})", hint)
 
 
 @contextmanager
 def no_bars() -> Iterator[None]:
-    """Switch off the progress bars of diffusers and transformers inside, and leave them as they were."""
+    """Disable the progress bars of diffusers and transformers inside the block; restores them afterwards."""
     shown = [host for host in HOSTS if host.is_progress_bar_enabled()]
     hub_is_quiet = are_progress_bars_disabled()
     for host in shown:
@@ -74,20 +74,20 @@ def no_bars() -> Iterator[None]:
     finally:
         for host in shown:
             host.enable_progress_bar()
-        if hub_is_quiet and shown:  # transformers' switch is the hub's as well
+        if hub_is_quiet and shown:  # transformers' switch also controls the hub's
             disable_progress_bars()
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A folder that may hold a prior; its ``name`` is what the user typed, a hub id or a path."""
+    """A folder that may contain a prior; ``name`` is what the user typed, a hub id or a path."""
 
     folder: Path
     name: str
     variant: str | None = None
 
     def read_json(self, path: str) -> dict[str, Any]:
-        """A JSON object in a file below the folder, empty if there is none; ``ValueError`` over another."""
+        """Read a JSON object from a file in the folder, empty without a file; ``ValueError`` if invalid."""
         file = self.folder / path
         if not file.is_file():
             return {}
@@ -96,7 +96,7 @@ class Layout:
         except (ValueError, RecursionError):
             content = None
         if not isinstance(content, dict):
-            bad_value(str(file), "a JSON object", "something else", "Save or fetch the folder anew.")
+            bad_value(str(file), "a JSON object", "something else", "Save or download the folder again.")
         return content
 
     @cached_property
@@ -105,13 +105,13 @@ class Layout:
         return self.read_json("model_index.json")
 
     def config(self, component: str) -> dict[str, Any]:
-        """Config of a component by its subfolder, ``""`` for the folder itself; empty where there is none."""
+        """Return a component's config by its subfolder, ``""`` for the folder itself; empty without one."""
         prefix = f"{component}/" if component else ""
         return self.read_json(f"{prefix}config.json") or self.read_json(f"{prefix}scheduler_config.json")
 
     @cached_property
     def licence(self) -> str:
-        """``license:`` of the model card's front matter, or ``"licence unknown"``."""
+        """``license:`` from the model card's front matter, or ``"licence unknown"``."""
         try:
             card = metadata_load(self.folder / "README.md") or {}
         except (OSError, ValueError, YAMLError):
@@ -119,50 +119,50 @@ class Layout:
         return str(card.get("license") or "licence unknown")
 
 
-def refuse(name: str) -> None:
-    """Say why a prior that is known not to work does not, by a ``ValueError``; others pass."""
+def check_supported(name: str) -> None:
+    """Raise ``ValueError`` with the reason for a prior that is known not to work; others pass."""
     last = Path(name).name.lower()
-    for pattern, reason in REFUSED.items():
+    for pattern, reason in UNSUPPORTED.items():
         if re.fullmatch(pattern, last):
-            bad_value("prior", "one that can be run", repr(name), f"It is refused because {reason}.")
+            bad_value("prior", "a supported prior", repr(name), f"It cannot be used: {reason}.")
 
 
 def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | None = None) -> Path:
-    """The folder of a prior, from the hub by options of ``snapshot_download``, with its configs at least."""
+    """Return a prior's folder, with its configs at least; ``hub`` are options of ``snapshot_download``."""
     if name == "bundled":
         return BUNDLED_FOLDER
     if os.path.isdir(name):
         return Path(name)
     if os.path.isfile(name):
-        cure = "Name its folder. A downloaded checkpoint becomes one by `geodiff convert`."
-        bad_value("prior", "'bundled', a folder or a hub id", f"the file {name}", cure)
+        hint = "Pass its folder. Convert a downloaded checkpoint with `geodiff convert`."
+        bad_value("prior", "'bundled', a folder or a hub id", f"the file {name}", hint)
     if name.count("/") > 1 or name.startswith((".", "/", "~")):
-        bad_value("prior", "'bundled', a folder that is there, or a hub id", repr(name), "Check the path.")
+        bad_value("prior", "'bundled', an existing folder, or a hub id", repr(name), "Check the path.")
     patterns, ignored = list(SMALL_FILES), None
     if weights and variant is None:
         patterns, ignored = patterns + WEIGHTS, OTHER_VARIANTS
     elif weights:
         patterns += [f"*.{variant}.safetensors", f"*.{variant}-*.safetensors"]
-    expected = "'bundled', a folder or a hub id that is cached or can be reached"
-    cure = "Fetch it once with `hf download ID` while online, give a folder, or use --prior bundled."
-    with reading("prior", expected, repr(name), cure):
+    expected = "'bundled', a folder, or a hub id that is cached or reachable"
+    hint = "Download it once with `hf download ID`, pass a folder, or use --prior bundled."
+    with reading("prior", expected, repr(name), hint):
         folder = snapshot_download(name, allow_patterns=patterns, ignore_patterns=ignored, **hub)
     return Path(folder)
 
 
 def check_weights(missing: Any, unexpected: Any, where: str) -> None:
-    """Refuse weights in ``where`` that do not fit their module by a ``ValueError`` that lists their names."""
+    """Raise ``ValueError`` listing the weights in ``where`` that do not match their module."""
     named = {"missing": sorted(map(str, missing)), "unexpected": sorted(map(str, unexpected))}
     parts = [f"{label}: {', '.join(keys)}" for label, keys in named.items() if keys]
     if parts:
-        cure = "These weights are of another architecture, or the file is damaged."
-        bad_value(f"weights in {where}", "those of its config, name by name", "; ".join(parts), cure)
+        hint = "These weights belong to another architecture, or the file is damaged."
+        bad_value(f"weights in {where}", "exactly the ones that its config requires", "; ".join(parts), hint)
 
 
 def _component_class(pipeline_class: type[Any], layout: Layout, name: str) -> type[Any]:
-    """The class of a component, as ``model_index.json`` names it, out of ``LIBRARIES`` alone.
+    """Return the class of a component named in ``model_index.json``, from ``LIBRARIES`` only.
 
-    In a pipeline of ours the constructor's annotation stands in for any other, and for a base class of it.
+    In this package's pipelines the constructor's annotation replaces an unknown class or a base class of it.
     """
     entry = layout.index.get(name)
     library, cls = entry if isinstance(entry, list) and len(entry) == 2 else ("", "")
@@ -174,18 +174,18 @@ def _component_class(pipeline_class: type[Any], layout: Layout, name: str) -> ty
         return expected
     if named is None:
         what = f"component {name!r} in {layout.folder / 'model_index.json'}"
-        cure = "Code that comes with weights is never run."
-        bad_value(what, "a class of diffusers or transformers", repr(entry), cure)
+        hint = "Code distributed with weights is never run."
+        bad_value(what, "a class of diffusers or transformers", repr(entry), hint)
     return named
 
 
 def _annotated(pipeline_class: type[Any]) -> dict[str, type[Any]]:
-    """Component classes by the names of a constructor's parameters; none of a pipeline of diffusers."""
+    """Return component classes by the names of a constructor's parameters; none for diffusers pipelines."""
     if pipeline_class.__module__.startswith("diffusers."):
         return {}
     classes = {}
     for name, hint in typing.get_type_hints(pipeline_class.__init__).items():
-        for cls in (hint, *typing.get_args(hint)):  # with None it is optional
+        for cls in (hint, *typing.get_args(hint)):  # optional ones are combined with None
             if hasattr(cls, "from_pretrained"):
                 classes[name] = cls
     return classes
@@ -194,21 +194,22 @@ def _annotated(pipeline_class: type[Any]) -> dict[str, type[Any]]:
 def load_component(
     layout: Layout, name: str, cls: type[Any], dtype: torch.dtype, unread: str | None = None
 ) -> Any:
-    """One component of a subfolder (``""``: the folder); a module's weights are checked name by name.
+    """Load one component from a subfolder (``""``: the folder), checking a module's weights by name.
 
-    With ``unread``, part of the names of weights that no forward reads, those may lack, and any be left over.
+    ``unread`` is part of the names of weights that no forward pass reads. They may be missing, and additional
+    weights are then allowed.
     """
     folder = str(layout.folder / name)
-    damaged = reading(f"component {name or 'model'!r} of {layout.name}", "one that can be read", folder, CURE)
+    damaged = reading(f"component {name or 'model'!r} of {layout.name}", "a readable component", folder, HINT)
     options: dict[str, Any] = {"local_files_only": True}
-    if cls.__module__.startswith("transformers."):  # which asks at the terminal where it is not told
+    if cls.__module__.startswith("transformers."):  # it would otherwise ask on the terminal
         options["trust_remote_code"] = False
     if not (issubclass(cls, torch.nn.Module) or cls.__name__.startswith("AutoModel")):
         with damaged:
             return cls.from_pretrained(folder, **options)
     if not any((layout.folder / name).glob("*.safetensors")):
-        cure = "`geodiff convert SRC DST` once makes such a folder of .bin, .ckpt or .pth."
-        bad_value(f"weights in {folder}", "safetensors", "none of them", cure)
+        hint = "`geodiff convert SRC DST` creates such a folder from .bin, .ckpt or .pth."
+        bad_value(f"weights in {folder}", "safetensors", "none", hint)
     if layout.variant is not None:
         options["variant"] = layout.variant
     with damaged:
@@ -225,9 +226,9 @@ def load_component(
 
 
 def build_pipeline(cls: type[Any], layout: Layout, dtype: torch.dtype, **options: Any) -> Any:
-    """A pipeline from the components that its constructor names and the options that the index holds.
+    """Build a pipeline from the components that its constructor names and the options in the index.
 
-    ``options`` are arguments of the constructor that go before the folder's; ``None`` is left out.
+    ``options`` are constructor arguments that override the folder's; ``None`` is ignored.
     """
     arguments = {name: value for name, value in options.items() if value is not None}
     annotated = _annotated(cls)
@@ -241,9 +242,9 @@ def build_pipeline(cls: type[Any], layout: Layout, dtype: torch.dtype, **options
         elif entry is not None and not isinstance(entry, list):
             arguments[name] = entry
         elif parameter.default is parameter.empty:
-            bad_value(str(layout.folder), f"a folder with the component {name!r}", "none of that name")
+            bad_value(str(layout.folder), f"a folder with the component {name!r}", "no such component")
     try:
         return cls(**arguments)
-    except (AttributeError, KeyError, TypeError) as error:  # our own classes say what they refuse
+    except (AttributeError, KeyError, TypeError) as error:  # this package's classes raise their own messages
         wrong = str(error)
-    bad_value(str(layout.folder / "model_index.json"), f"the index of a {cls.__name__}", wrong, CURE)
+    bad_value(str(layout.folder / "model_index.json"), f"the index of a {cls.__name__}", wrong, HINT)

@@ -1,4 +1,4 @@
-"""A depth map from any other model as a prior: one step, no network, the map is the estimate."""
+"""A depth map from any other model as a prior: one step without a network; the map is the estimate."""
 
 from __future__ import annotations
 
@@ -12,35 +12,36 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin._internal.checks import bad_type, bad_value
 from geodiff_plugin.algorithm.edges import sharpen_edges
-from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
+from geodiff_plugin.algorithm.solver import solve_field
+from geodiff_plugin.algorithm.systems import FieldSystem
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 from geodiff_plugin.priors.transformers_depth import range_of
 
-#: What ``load_prior("map")`` loads: no folder is there, and none is needed.
+#: Layout of ``load_prior("map")``, which needs no folder.
 MAP_LAYOUT = Layout(Path(__file__).with_suffix(""), "map")
-#: Weight of a known pixel against its links to its neighbours, where holes are filled.
-FIRM = 100.0
-#: Conjugate-gradient steps of the fill, for every grid of the pyramid.
+#: Weight of a known pixel relative to the affinities to its neighbours when holes are filled.
+KNOWN_WEIGHT = 100.0
+#: Conjugate-gradient steps of the fill per grid of the pyramid.
 FILL_STEPS = 20
-#: Where a resized map mixes in less than this of a hole, its value is the map's.
+#: Known fraction above which a pixel of a resized map keeps the map's value.
 ALL_KNOWN = 0.999
-#: Image pixels to a pixel of the map from which its edges are made steep again after enlargement.
-ENLARGED = 1.5
-#: Offset that makes a map in [0, 1] a stand-in for inverse depth, in which edges are relative steps.
+#: Image pixels per map pixel above which edges are sharpened after upsampling.
+MIN_UPSAMPLING = 1.5
+#: Offset that turns a map in [0, 1] into a substitute for inverse depth, in which edges are relative steps.
 OFFSET = 0.25
-#: Product of the logs of width over height below which a wide map belongs to no tall image.
-UPRIGHT = -0.01
+#: Product of the log aspect ratios below which map and image have opposite orientations.
+MIN_LOG_PRODUCT = -0.01
 
 
 class DepthMapPipeline(DirectMapPipeline):
-    """Takes ``depth_map=`` in the call in place of a network; what guidance moves is the map itself.
+    """Takes ``depth_map=`` in the call instead of a network; guidance changes the map itself.
 
-    ``processing_resolution`` is the longer side of the map that is guided, 0 for the image's own.
+    ``processing_resolution`` is the longer side of the guided map, 0 for the image's own size.
     """
 
     def __init__(
@@ -51,31 +52,31 @@ class DepthMapPipeline(DirectMapPipeline):
         default_processing_resolution: int = 0,
     ) -> None:
         super().__init__()
-        self._place = torch.device("cpu")  # there are no weights that would tell
+        self._device = torch.device("cpu")  # no weights that define a device
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
         self.register_prior({"scheduler": scheduler}, *defaults, image_processor=1)
 
     @property
     def device(self) -> torch.device:
-        """Where calls run."""
-        return self._place
+        """Device on which calls run."""
+        return self._device
 
     def to(self, *args: Any, **kwargs: Any) -> DepthMapPipeline:
-        """As ``DiffusionPipeline.to``; maps stay in float32."""
+        """Move as in ``DiffusionPipeline.to``; maps stay in float32."""
         for target in (*args, *kwargs.values()):
             if isinstance(target, (str, int, torch.device)):
-                self._place = torch.device(target)
+                self._device = torch.device(target)
         return self
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """A pipeline that consists of a ``DirectScheduler`` alone."""
+        """Recognise a pipeline that consists of a ``DirectScheduler`` only."""
         parts = [name for name, value in layout.index.items() if isinstance(value, list)]
         return parts == ["scheduler"] and layout.index["scheduler"][1] == DirectScheduler.__name__
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> DepthMapPipeline:
-        """A pipeline without weights; of ``"map"`` the values are depth unless ``space`` says otherwise."""
+        """Create a pipeline without weights; ``"map"`` contains depth unless ``space`` states otherwise."""
         if layout == MAP_LAYOUT:
             return cls(DirectScheduler(timestep=0), space or "depth")
         return super().load(layout, dtype, space)
@@ -88,10 +89,10 @@ class DepthMapPipeline(DirectMapPipeline):
         generator: Generators,
         depth_map: np.ndarray | Tensor | Sequence[np.ndarray | Tensor] | None = None,
     ) -> Condition:
-        """The maps on the image's grid, from 0 to about 1, holes filled smoothly.
+        """Resample the maps to the image's grid, from 0 to about 1, with holes filled smoothly.
 
-        ``depth_map`` has for every image a map ``(h, w)`` of any size and unit that covers the same view, in
-        an array ``(N, h, w)`` or a list; not finite where nothing is known.
+        ``depth_map`` has one map ``(h, w)`` per image, of any size and unit, that covers the same view, as an
+        array ``(N, h, w)`` or a list; non-finite where unknown.
         """
         maps = _as_list(depth_map)
         if len(maps) != len(image):
@@ -99,7 +100,7 @@ class DepthMapPipeline(DirectMapPipeline):
         size, prepared = image_size(image), []
         for values, view in zip(maps, image.float().split(1), strict=True):
             sides = values.shape[-1] / values.shape[-2], size[1] / size[0]
-            if math.log(sides[0]) * math.log(sides[1]) < UPRIGHT:
+            if math.log(sides[0]) * math.log(sides[1]) < MIN_LOG_PRODUCT:
                 got = "{1}x{0} pixels".format(*values.shape[-2:])
                 bad_value("depth_map", f"of the image's {size[1]}x{size[0]} pixels", got, "Is it transposed?")
             filled, known = _filled(values.to(view.device))
@@ -113,10 +114,10 @@ class DepthMapPipeline(DirectMapPipeline):
 
 
 def _as_list(given: Any) -> list[Tensor]:
-    """``depth_map`` as maps ``(1, 1, h, w)`` float32 from 0, NaN where unknown."""
+    """Convert ``depth_map`` to maps ``(1, 1, h, w)`` float32 starting at 0, NaN where unknown."""
     if given is None:
-        cure = "pipe(left, depth_map=array, guidance=...), or --prior-map FILE."
-        bad_value("depth_map", "given with the prior 'map'", "nothing", cure)
+        hint = "Use pipe(left, depth_map=array, guidance=...), or --prior-map FILE."
+        bad_value("depth_map", "given with the prior 'map'", "nothing", hint)
     if isinstance(given, (np.ndarray, Tensor)):
         given = given[..., 0] if given.ndim == 3 and given.shape[-1] == 1 else given  # (H, W, 1)
         given = [given] if given.ndim == 2 else list(given)
@@ -126,22 +127,23 @@ def _as_list(given: Any) -> list[Tensor]:
 
 
 def _from_zero(given: np.ndarray | Tensor) -> Tensor:
-    """One map less its least value, ``(1, 1, h, w)`` float32, NaN where unknown."""
+    """Subtract the minimum of one map, ``(1, 1, h, w)`` float32, NaN where unknown."""
     values = torch.as_tensor(np.ascontiguousarray(given) if isinstance(given, np.ndarray) else given)
     if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():
         bad_value("depth_map", "a map (h, w) of 2 x 2 pixels or more", f"shape {tuple(values.shape)}")
-    # Not float64 for all: Apple's GPUs lack it, and of two float32 the difference is as exact in float32.
+    # Not float64 for all: Apple GPUs lack it, and the difference of two float32 values is as exact in
+    # float32.
     values = values if values.dtype in (torch.float32, torch.float64) else values.float()
     inside = values.isfinite()
     if not inside.any() or values[inside].min() == values[inside].max():
-        cure = "Not finite means unknown; a map must tell near from far somewhere."
-        bad_value("depth_map", "a map with two different finite values", "none", cure)
+        hint = "Non-finite values mean unknown; a map needs at least two different depths."
+        bad_value("depth_map", "a map with two different finite values", "none", hint)
     low = values[inside].min()  # before float32, which would round a small range far from 0
     return torch.where(inside, values - low, values.new_tensor(torch.nan)).float()[None, None]
 
 
 def _filled(values: Tensor) -> tuple[Tensor, Tensor]:
-    """A map with its least value at 0 and its 98 % quantile at 1, holes filled, and where it is known."""
+    """Scale a map's minimum to 0 and its 98 % quantile to 1, fill holes, and return where it is known."""
     known = values.isfinite()
     low, high = range_of(values[known][None, None, None])
     if high <= low:  # nearly all of it is flat
@@ -149,18 +151,18 @@ def _filled(values: Tensor) -> tuple[Tensor, Tensor]:
     values = torch.where(known, (values - low) / (high - low), torch.zeros_like(values))
     if bool(known.all()):
         return values, known
-    weight, links = FIRM * known.float(), torch.ones_like(values)
-    system = FieldSystem(weight, weight * values, links[..., 1:], links[..., 1:, :])
+    weight, affinities = KNOWN_WEIGHT * known.float(), torch.ones_like(values)
+    system = FieldSystem(weight, weight * values, affinities[..., 1:], affinities[..., 1:, :])
     return torch.where(known, values, solve_field(system, FILL_STEPS)), known
 
 
 def _resized(values: Tensor, left_01: Tensor) -> Tensor:
-    """A map ``(1, 1, h, w)`` at the size of its image, its edges steep again after enlargement."""
+    """Resize a map ``(1, 1, h, w)`` to its image, with edges sharpened after upsampling."""
     size = image_size(left_01)
     if image_size(values) == size:
         return values
     resized = F.interpolate(values, size, mode="bilinear", antialias=True)
     ratio = max(new / old for new, old in zip(size, image_size(values), strict=True))
-    if ratio < ENLARGED:
+    if ratio < MIN_UPSAMPLING:
         return resized
     return 1.0 / sharpen_edges(1.0 / (resized + OFFSET), left_01, round(ratio)) - OFFSET

@@ -1,4 +1,4 @@
-"""Every prior of ``MarigoldDepthPipeline`` (S3.1), and those tuned end to end to one (arXiv 2409.11355)."""
+"""Priors of ``MarigoldDepthPipeline`` (S3.1), including those fine-tuned end to end (arXiv 2409.11355)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, UNet2
 from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.priors.loading import Layout, build_pipeline
-from geodiff_plugin.priors.pipeline import DepthPrior, decode_picture, encode_picture, map_of, picture_of
+from geodiff_plugin.priors.pipeline import DepthPrior, decode_image, encode_image, image_of_map, map_of
 
 
 class MarigoldPrior(DepthPrior):
-    """Adapter of ``MarigoldDepthPipeline``; its ``prediction_type`` must be a key of ``SPACES``."""
+    """Adapter for ``MarigoldDepthPipeline``; its ``prediction_type`` must be a key of ``SPACES``."""
 
     pipeline_class: type[Any] = MarigoldDepthPipeline
 
@@ -24,12 +24,12 @@ class MarigoldPrior(DepthPrior):
 
     @property
     def network_input(self) -> slice:
-        """What follows the image latent."""
+        """Channels after the image latent."""
         return slice(self._pipe.vae.config.latent_channels, None)
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """A U-Net on image and depth latent, no class labels, a text encoder for the empty prompt."""
+        """Recognise a U-Net on image and depth latent, without class labels, and a text encoder."""
         unet = layout.config("unet")
         latent = layout.config("vae").get("latent_channels", 4)
         return (
@@ -41,29 +41,29 @@ class MarigoldPrior(DepthPrior):
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
-        """The stock pipeline; folders of v1-0 do not say what they predict, which is depth."""
+        """Load the stock pipeline; v1-0 folders do not state what they predict, which is depth."""
         space = space or layout.index.get("prediction_type") or "depth"
         return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
 
     def network(self) -> tuple[torch.nn.Module, str]:
-        """The U-Net's forward; its input is ``cat[image latent, depth latent]``."""
+        """Return the U-Net's forward method; its input is ``cat[image latent, depth latent]``."""
         return self._pipe.unet, "forward"
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Mean of the channels that the pipeline's VAE decodes, not clipped."""
-        return map_of(decode_picture(self._pipe.vae, z0))
+        """Average the channels decoded by the pipeline's VAE, unclipped."""
+        return map_of(decode_image(self._pipe.vae, z0))
 
     def encode(self, x: Tensor) -> Tensor:
-        """By the pipeline's VAE."""
-        return encode_picture(self._pipe.vae, picture_of(x))
+        """Encode with the pipeline's VAE."""
+        return encode_image(self._pipe.vae, image_of_map(x))
 
 
 class E2EFTPipeline(MarigoldDepthPipeline):
     """``MarigoldDepthPipeline`` that starts from zeros and takes one step, whose result is the clean latent.
 
-    Of its scheduler the betas count: it becomes a DDIM with trailing spacing whose last step ends at no noise
-    at all (the authors read ``pred_original_sample`` instead). Arguments as ``MarigoldDepthPipeline``'s;
-    ``initial_latents`` is saved, so that the folder differs from Marigold's.
+    Only the betas of its scheduler are used: it becomes a DDIM with trailing spacing whose last step ends
+    without noise (the authors read ``pred_original_sample`` instead). Arguments as in
+    ``MarigoldDepthPipeline``; ``initial_latents`` is saved to distinguish the folder from Marigold's.
     """
 
     def __init__(
@@ -89,21 +89,21 @@ class E2EFTPipeline(MarigoldDepthPipeline):
         self.register_to_config(initial_latents=initial_latents)
 
     def check_inputs(self, image: Any, num_inference_steps: int, *args: Any, **kwargs: Any) -> int:
-        """Marigold's checks, and a ``ValueError`` for more steps than one."""
+        """Run Marigold's checks, and raise ``ValueError`` for more than one step."""
         if num_inference_steps is not None and num_inference_steps > 1:
-            bad_value("num_inference_steps", "1 with a prior that was tuned for it", num_inference_steps)
+            bad_value("num_inference_steps", "1 with a prior fine-tuned for one step", num_inference_steps)
         return super().check_inputs(image, num_inference_steps, *args, **kwargs)
 
     def prepare_latents(
         self, image: Tensor, latents: Tensor | None, generator: Any, *args: Any, **kwargs: Any
     ) -> tuple[Tensor, Tensor]:
-        """Image latents, and zeros where the caller gives no latents; nothing is drawn."""
+        """Return image latents, and zeros if the caller gives no latents; nothing is sampled."""
         image_latent, start = super().prepare_latents(image, latents, generator, *args, **kwargs)
         return image_latent, torch.zeros_like(start) if latents is None else start
 
 
 class E2EFTPrior(MarigoldPrior):
-    """Adapter of ``E2EFTPipeline``; network, input and decoder are Marigold's."""
+    """Adapter for ``E2EFTPipeline``; network, input and decoder are Marigold's."""
 
     pipeline_class = E2EFTPipeline
     max_steps = 1
@@ -111,10 +111,11 @@ class E2EFTPrior(MarigoldPrior):
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """Marigold's components, and a schedule that Marigold has not: trailing, betas as they were.
+        """Recognise Marigold's components with a schedule that Marigold lacks: trailing with unscaled betas.
 
-        Marigold v1-0 is leading, v1-1 rescales its betas, the LCM says from how many steps it was distilled.
-        Where a folder keeps Marigold's scheduler, "e2e-ft" in the name decides, or ``e2e-ft:`` before it.
+        Marigold v1-0 is leading, v1-1 rescales its betas, and the LCM states the number of steps it was
+        distilled from. If a folder keeps Marigold's scheduler, "e2e-ft" in the name decides, or the prefix
+        ``e2e-ft:``.
         """
         if not MarigoldPrior.recognises(layout):
             return False

@@ -1,4 +1,4 @@
-"""Marigold V2: one step of an image editing transformer on the image's latent (arXiv 2609.08084)."""
+"""Marigold V2: one step of an image-editing transformer on the image latent (arXiv 2609.08084)."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from diffusers import (
 from diffusers.utils.accelerate_utils import apply_forward_hook
 from torch import Tensor
 
-from geodiff_plugin.priors.components import FixedPrompt, SidesOf
+from geodiff_plugin.priors.components import FixedPrompt, ResizeToMultiple
 from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, map_of, widened
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, map_of, upcast
 
-#: First word of a checkpoint's name -> what its map is affine in.
+#: Space in which the map is affine, by the first word of a checkpoint's name.
 SPACE_OF_CHECKPOINT = {"log": "log", "uniform": "depth", "disparity": "disparity"}
-#: Timestep input of the network, of 1000. The authors write 499 / 1000 in bfloat16, where 499 is 500.
+#: Timestep input of the network, of 1000. The authors use 499 / 1000 in bfloat16, which rounds to 500.
 TIMESTEP = 500.0
-#: Pixels along the side of the square of one token.
+#: Side of the square of one token, pixels.
 SIDE = 16
-#: Pixels along the side of the cell of one latent.
+#: Side of the cell of one latent, pixels.
 CELL = 8
 
 
 def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of the latents by channel, ``(1, C, 1, 1)`` each."""
+    """Return mean and standard deviation of the latents per channel, ``(1, C, 1, 1)`` each."""
     numbers = vae.config.latents_mean, vae.config.latents_std
     mean, deviation = (like.new_tensor(values).view(1, -1, 1, 1) for values in numbers)
     return mean, deviation
@@ -35,7 +35,7 @@ def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tens
 
 @apply_forward_hook
 def _decode(vae: AutoencoderKLQwenImage, z: Tensor) -> Tensor:
-    """``vae._decode`` of one frame, for which nothing is cached; the hook brings an offloaded one back."""
+    """Run ``vae._decode`` for one frame without caching; the hook brings an offloaded VAE back."""
     tile = vae.tile_sample_min_height // CELL, vae.tile_sample_min_width // CELL
     if vae.use_tiling and (z.shape[-2] > tile[0] or z.shape[-1] > tile[1]):
         return vae.tiled_decode(z, return_dict=False)[0]
@@ -43,12 +43,12 @@ def _decode(vae: AutoencoderKLQwenImage, z: Tensor) -> Tensor:
 
 
 class MarigoldV2Pipeline(DepthDiffusionPipeline):
-    """Depth in one step of rectified flow that starts from the image's own latent.
+    """Depth in one step of rectified flow that starts from the image latent.
 
-    The transformer recomputes its blocks in a backward pass (``enable_gradient_checkpointing``), without
-    which the full gradient does not fit. ``processing_resolution=0`` is what the authors measure at; they
-    trained at 768. With ``sample_latent`` the image's latent is drawn from the posterior, as in their
-    ``infer.py``; else it is its mode.
+    The transformer recomputes its blocks in the backward pass (``enable_gradient_checkpointing``); otherwise
+    the full gradient does not fit in memory. The authors evaluate at ``processing_resolution=0`` and trained
+    at 768. With ``sample_latent`` the image latent is sampled from the posterior, as in their ``infer.py``;
+    otherwise it is the mode.
     """
 
     max_steps = 1
@@ -70,11 +70,13 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         transformer.enable_gradient_checkpointing()
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
         modules = {"transformer": transformer, "vae": vae, "scheduler": scheduler, "prompt": prompt}
-        self.register_prior(modules, *defaults, SidesOf(SIDE, grow=True), sample_latent=sample_latent)
+        self.register_prior(
+            modules, *defaults, ResizeToMultiple(SIDE, grow=True), sample_latent=sample_latent
+        )
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """A transformer over joint image and text tokens, a video autoencoder, a saved prompt."""
+        """Recognise a transformer on image and text tokens, a video autoencoder, and a saved prompt."""
         return (
             "joint_attention_dim" in layout.config("transformer")
             and "latents_mean" in layout.config("vae")
@@ -84,31 +86,31 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
-        """Latent of the image, of every member anew where it is drawn, and the prompt."""
+        """Return the image latent, sampled per member if configured, and the prompt."""
         draws = self.config.sample_latent
         latent = self.image_latents(image, ensemble_size, batch_size, generator, draws).to(image.dtype)
         prompt = self.prompt().to(latent.device).expand(len(latent), -1, -1)
         return {"image_latent": latent, "prompt": prompt}  # (N * E, 16, h, w), (N * E, n, C)
 
     def encode_moments(self, image: Tensor) -> Tensor:
-        """Of the one frame."""
+        """Encode a single frame."""
         return self.vae.encode(image.to(self.vae.dtype)[:, :, None]).latent_dist.parameters[:, :, 0]
 
     def scale_latents(self, latents: Tensor) -> Tensor:
-        """Normalised channel by channel, float32 or wider."""
-        mean, deviation = _statistics(self.vae, widened(latents))
-        return (widened(latents) - mean) / deviation
+        """Normalize channel by channel, float32 or wider."""
+        mean, deviation = _statistics(self.vae, upcast(latents))
+        return (upcast(latents) - mean) / deviation
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """The image's latent, from which the one step starts."""
+        """Return the image latent, from which the single step starts."""
         return condition["image_latent"]
 
     def set_timesteps(self, num_inference_steps: int, device: torch.device) -> None:
-        """A step of the whole length, ``z - v``, whatever the timestep input of the network."""
+        """Set a single step of full length, ``z - v``, for any timestep input of the network."""
         self.scheduler.set_timesteps(sigmas=[1.0], timesteps=[TIMESTEP], device=device)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """Velocity from the depth's latent to the image's."""
+        """Predict the velocity from the depth latent to the image latent."""
         prompt, (batch, channels, height, width) = condition["prompt"], latents.shape
         tokens = QwenImageEditPipeline._pack_latents(latents, batch, channels, height, width)
         velocity = self.transformer(
@@ -121,18 +123,18 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         frames = QwenImageEditPipeline._unpack_latents(velocity, CELL * height, CELL * width, CELL)
         return frames[:, :, 0].to(latents.dtype)
 
-    def decode_picture(self, z0: Tensor) -> Tensor:
-        """One frame, as ``vae.decode`` but for its clamp, which has no gradient where near and far lie."""
-        wide = widened(z0)
+    def decode_image(self, z0: Tensor) -> Tensor:
+        """Decode one frame like ``vae.decode`` without its clamp, which has no gradient at near and far."""
+        wide = upcast(z0)
         mean, deviation = _statistics(self.vae, wide)
         z = (wide * deviation + mean).to(self.vae.dtype)[:, :, None]
         frames = [_decode(self.vae, part) for part in (z.split(1) if self.vae.use_slicing else (z,))]
         return torch.cat(frames)[:, :, 0].to(wide.dtype)
 
-    def encode_picture(self, picture: Tensor) -> Tensor:
-        """Mode of the code of one frame, float32 or wider."""
-        return self.scale_latents(self.encode_moments(picture).chunk(2, dim=1)[0])
+    def encode_image(self, rgb: Tensor) -> Tensor:
+        """Return the mode of the latent of one frame, float32 or wider."""
+        return self.scale_latents(self.encode_moments(rgb).chunk(2, dim=1)[0])
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
-        """As the authors end: every channel is clipped, then their mean taken."""
-        return map_of(self.decode_picture(latents).clamp(-1.0, 1.0))
+        """Decode like the authors: clip every channel, then average."""
+        return map_of(self.decode_image(latents).clamp(-1.0, 1.0))

@@ -1,4 +1,4 @@
-"""``DepthPrior``, the interface of a prior; a denoising loop for priors without a diffusers pipeline (S4)."""
+"""``DepthPrior``, the interface of priors, and a denoising loop for those without a pipeline (S4)."""
 
 from __future__ import annotations
 
@@ -15,55 +15,55 @@ from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImage
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number
+from geodiff_plugin._internal.checks import bad_type, bad_value, check_choice, check_number
 from geodiff_plugin.priors.loading import Layout, build_pipeline
 from geodiff_plugin.scale.space import SPACES, DepthRange, PriorMaps
 
 Condition = dict[str, Tensor]
 Generators = torch.Generator | list[torch.Generator] | None
-#: Ways of resampling that the stock pipeline takes.
+#: Resampling modes of the stock pipeline.
 RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
 
 
-def widened(x: Tensor) -> Tensor:
-    """Half precision as float32; wider types unchanged."""
+def upcast(x: Tensor) -> Tensor:
+    """Convert half precision to float32; wider dtypes are unchanged."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
-def picture_of(x: Tensor) -> Tensor:
-    """A map ``(B, 1, H, W)``, 0 to 1, as a picture ``(B, 3, H, W)``, -1 to 1."""
+def image_of_map(x: Tensor) -> Tensor:
+    """Convert a map ``(B, 1, H, W)`` in [0, 1] to an image ``(B, 3, H, W)`` in [-1, 1]."""
     return (2.0 * x - 1.0).expand(-1, 3, -1, -1)
 
 
-def map_of(picture: Tensor) -> Tensor:
-    """Mean of the channels of a picture ``(B, 3, H, W)``, from [-1, 1] to [0, 1]: ``(B, 1, H, W)``."""
-    return (picture.mean(dim=1, keepdim=True) + 1.0) / 2.0
+def map_of(rgb: Tensor) -> Tensor:
+    """Average the channels of an image ``(B, 3, H, W)`` and map [-1, 1] to [0, 1]: ``(B, 1, H, W)``."""
+    return (rgb.mean(dim=1, keepdim=True) + 1.0) / 2.0
 
 
-def stretched(maps: Tensor) -> Tensor:
-    """Maps ``(B, 1, H, W)``, each stretched to [0, 1]."""
+def normalized(maps: Tensor) -> Tensor:
+    """Normalize each of the maps ``(B, 1, H, W)`` to [0, 1]."""
     low, high = maps.amin((1, 2, 3), keepdim=True), maps.amax((1, 2, 3), keepdim=True)
     return (maps - low) / (high - low).clamp_min(torch.finfo(maps.dtype).tiny)
 
 
-def encode_picture(vae: Any, picture: Tensor) -> Tensor:
-    """Scaled latents ``(B, C, h, w)`` of pictures, the posterior's mode, float32 or wider."""
-    encoded = vae.encode(picture.to(vae.dtype))
+def encode_image(vae: Any, rgb: Tensor) -> Tensor:
+    """Encode images to scaled latents ``(B, C, h, w)``, the posterior's mode, float32 or wider."""
+    encoded = vae.encode(rgb.to(vae.dtype))
     latents = encoded.latent_dist.mode() if hasattr(encoded, "latent_dist") else encoded.latents
-    return widened(latents) * vae.config.scaling_factor
+    return upcast(latents) * vae.config.scaling_factor
 
 
-def decode_picture(vae: Any, z0: Tensor) -> Tensor:
-    """Scaled latents ``(B, C, h, w)`` as pictures ``(B, 3, H, W)``, about [-1, 1], float32 or wider.
+def decode_image(vae: Any, z0: Tensor) -> Tensor:
+    """Decode scaled latents ``(B, C, h, w)`` to images ``(B, 3, H, W)``, about [-1, 1], float32 or wider.
 
-    Unlike in the stock pipelines it is not clipped: clipping has no gradient at near and far.
+    Unlike in the stock pipelines the result is not clipped: clipping has no gradient at near and far.
     """
-    return widened(vae.decode((z0 / vae.config.scaling_factor).to(vae.dtype), return_dict=False)[0])
+    return upcast(vae.decode((z0 / vae.config.scaling_factor).to(vae.dtype), return_dict=False)[0])
 
 
 @dataclass
 class DepthOutput(MarigoldDepthOutput):
-    """``MarigoldDepthOutput``, and further maps by name, such as ``"normals"``, of any channels."""
+    """``MarigoldDepthOutput`` with further maps by name, such as ``"normals"``, of any number of channels."""
 
     extras: dict[str, np.ndarray | Tensor] = field(default_factory=dict)
 
@@ -71,16 +71,16 @@ class DepthOutput(MarigoldDepthOutput):
 class DepthPrior:
     """Interface of a prior, which has no access to cameras.
 
-    A ``DepthDiffusionPipeline`` is a prior itself; others need an adapter, such as ``MarigoldPrior``.
+    A ``DepthDiffusionPipeline`` is itself a prior; others need an adapter, such as ``MarigoldPrior``.
 
     Attributes:
-        config: of the pipeline; its ``prediction_type`` says what the decoded map is affine in.
-        max_steps: upper bound on the denoising steps, ``None`` for none. Below ``min_steps`` a guided call
-            runs the rounds of all these steps within the allowed ones.
-        deterministic: the same image always gives the same map, so an ensemble has one member.
-        takes_prompt: the call takes ``prompt_depth``, depths that the network starts from.
+        config: config of the pipeline; ``prediction_type`` is the space in which the decoded map is affine.
+        max_steps: maximum number of denoising steps, ``None`` for no limit. Below ``min_steps`` a guided call
+            runs the rounds of all steps within the allowed ones.
+        deterministic: whether the same image always gives the same map, so that an ensemble has one member.
+        takes_prompt: whether the call takes ``prompt_depth``, depths that the network starts from.
         depth_channels: depth channels of the scheduler's latents; guidance does not change the others.
-        metric_range: of a metric prior, ``(N * E, 2)`` metres at 0 and at 1 of its maps; else ``None``.
+        metric_range: for a metric prior, ``(N * E, 2)`` metres at 0 and at 1 of its maps; else ``None``.
         valid: ``(N * E, 1, H, W)`` bool, pixels of the processing grid with a prior depth; ``None`` for all.
     """
 
@@ -94,14 +94,14 @@ class DepthPrior:
 
     @property
     def space(self) -> str:
-        """What the decoded map is affine in, key of ``SPACES``; depth if the config has none."""
+        """Space in which the decoded map is affine, key of ``SPACES``; depth if the config has none."""
         space = self.config.get("prediction_type") or "depth"
         return check_choice(space, "the pipeline's prediction_type", SPACES)
 
     def maps_of(self, samples: slice) -> PriorMaps:
-        """What is known of the maps of some of the ``N * E`` samples, once the call has seen its images."""
+        """Return the known properties of the maps of some of the ``N * E`` samples of the current call."""
         depth_range = None
-        if self.metric_range is not None:  # nearest first: of disparity that is at x = 1
+        if self.metric_range is not None:  # nearest first, which is at x = 1 in disparity
             depth_range = DepthRange(*self.metric_range[samples].T.sort(0).values)
         return PriorMaps(self.space, None if self.valid is None else self.valid[samples], depth_range)
 
@@ -112,40 +112,40 @@ class DepthPrior:
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """Whether a folder holds this prior, by its component configs and never by ``_class_name``."""
+        """Return whether a folder contains this prior, by its component configs, never by ``_class_name``."""
         return False
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
-        """The pipeline of a recognised folder; ``space`` is the user's choice, or ``None``."""
+        """Load the pipeline of a recognised folder; ``space`` is the user's choice, or ``None``."""
         return build_pipeline(cls, layout, dtype, prediction_type=space)
 
     def network(self) -> tuple[Any, str]:
-        """Object and name of the method by which the loop calls the network once a step."""
+        """Return the object and the name of its method that the loop calls once per step."""
         raise NotImplementedError
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)``, about [0, 1], float32 or wider, of the depth channels.
+        """Decode depth channels to an unclipped map ``(B, 1, H, W)``, about [0, 1], float32 or wider.
 
-        It may lack the rows and columns beyond the last whole cell of the latent; a guided call repeats them.
+        It may lack the rows and columns beyond the last whole latent cell; a guided call replicates them.
         """
         raise NotImplementedError
 
     def encode(self, x: Tensor) -> Tensor:
-        """Approximate inverse of ``decode``, for a map on the padded grid, also beyond [0, 1]."""
+        """Encode a map on the padded grid, also beyond [0, 1]; approximate inverse of ``decode``."""
         raise NotImplementedError
 
 
 class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
-    """Depth of an image by a latent (or pixel) diffusion prior.
+    """Depth of an image from a latent (or pixel) diffusion prior.
 
-    A subclass defines how its network is called, by ``prepare_condition`` and ``denoise``, and overrides
-    other methods if needed. Preprocessing, batching, ensembling, resizing and the arguments of the call are
-    those of ``MarigoldDepthPipeline``.
+    A subclass defines how its network is called in ``prepare_condition`` and ``denoise``, and overrides other
+    methods if needed. Preprocessing, batching, ensembling, resizing and the arguments of the call are as
+    in ``MarigoldDepthPipeline``.
 
     Attributes:
-        sees_latents: whether latents are an input of the network (else there is no z_t).
-        output_resampling: how its authors resize the map to the image.
+        sees_latents: whether latents are an input of the network (otherwise there is no z_t).
+        output_resampling: the authors' mode for resizing the map to the image.
     """
 
     sees_latents = True
@@ -160,7 +160,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         image_processor: MarigoldImageProcessor | int = 8,
         **config: Any,
     ) -> None:
-        """Register components and options; to be called last in a subclass's constructor.
+        """Register components and options; call this last in a subclass's constructor.
 
         ``image_processor`` resizes and pads; a number pads sides to its multiples. ``config`` is saved too.
         """
@@ -183,7 +183,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return self.depth_channels if self.sees_latents else None
 
     def network(self) -> tuple[Any, str]:
-        """This pipeline and ``"denoise"``."""
+        """Return this pipeline and ``"denoise"``."""
         return self, "denoise"
 
     def prepare_condition(
@@ -195,50 +195,50 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         *args: Any,
         **options: Any,
     ) -> Condition:
-        """All inputs of the network except latents and time, ``N * E`` each, members side by side.
+        """Prepare all inputs of the network except latents and time, ``N * E`` each, grouped by image.
 
-        ``image (N, 3, H, W)`` is in [-1, 1], padded, of the pipeline's dtype; E is ``ensemble_size``;
-        ``generator`` is for priors that draw samples here, ``options`` are further arguments of the call.
+        ``image (N, 3, H, W)`` is in [-1, 1], padded, in the pipeline's dtype; E is ``ensemble_size``;
+        ``generator`` is for priors that sample here; ``options`` are further arguments of the call.
         """
         raise NotImplementedError
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """Initial latents shaped as ``condition["image_latent"]``: Gaussian, or zeros if not used."""
+        """Return initial latents shaped like ``condition["image_latent"]``: Gaussian, or zeros if unused."""
         like = condition["image_latent"]
         if not self.sees_latents:
             return torch.zeros_like(like)
         return randn_tensor(like.shape, generator=generator, device=like.device, dtype=like.dtype)
 
     def set_timesteps(self, num_inference_steps: int, device: torch.device) -> None:
-        """Start a trajectory of ``self.scheduler``; it must go through ``scheduler.set_timesteps``."""
+        """Start a trajectory of ``self.scheduler``; must go through ``scheduler.set_timesteps``."""
         self.scheduler.set_timesteps(num_inference_steps, device=device)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The network's output for latents ``(B, C, h, w)``, as the scheduler's ``step`` takes it."""
+        """Run the network on latents ``(B, C, h, w)``; the output is an input of the scheduler's ``step``."""
         raise NotImplementedError
 
-    def decode_picture(self, z0: Tensor) -> Tensor:
-        """Unclipped pictures ``(B, 3, H, W)``, about [-1, 1], of clean latents, by ``self.vae``."""
-        return decode_picture(self.vae, z0)
+    def decode_image(self, z0: Tensor) -> Tensor:
+        """Decode clean latents with ``self.vae`` to unclipped images ``(B, 3, H, W)``, about [-1, 1]."""
+        return decode_image(self.vae, z0)
 
-    def encode_picture(self, picture: Tensor) -> Tensor:
-        """Approximate inverse of ``decode_picture``, float32 or wider."""
-        return encode_picture(self.vae, picture)
+    def encode_image(self, rgb: Tensor) -> Tensor:
+        """Encode images, float32 or wider; approximate inverse of decoding."""
+        return encode_image(self.vae, rgb)
 
     def decode(self, z0: Tensor) -> Tensor:
-        """By ``decode_picture``."""
-        return map_of(self.decode_picture(z0))
+        """Decode through ``decode_image``."""
+        return map_of(self.decode_image(z0))
 
     def encode(self, x: Tensor) -> Tensor:
-        """By ``encode_picture``."""
-        return self.encode_picture(picture_of(x))
+        """Encode through ``encode_image``."""
+        return self.encode_image(image_of_map(x))
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
-        """Maps of the unguided call, ``(B, 1, H, W)`` in [0, 1]; override for the authors' last steps."""
+        """Decode maps of the unguided call, ``(B, 1, H, W)`` in [0, 1]; override to match the authors."""
         return self.decode(latents[:, self.depth_channels]).clamp(0.0, 1.0)
 
     def decode_extras(self, latents: Tensor, ensemble_size: int) -> dict[str, Tensor]:
-        """Further maps by name, ``(N, C, H, W)`` on the padded grid, of latents ``(N * E, C, h, w)``."""
+        """Decode further maps by name, ``(N, C, H, W)`` on the padded grid, from ``(N * E, C, h, w)``."""
         return {}
 
     def image_latents(
@@ -249,28 +249,28 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         generator: Generators = None,
         sample: bool = False,
     ) -> Tensor:
-        """Scaled latents ``(N * E, C, h, w)`` of images, the posterior's mode or a ``sample`` per member."""
+        """Encode images to scaled latents ``(N * E, C, h, w)``, the mode or a ``sample`` per member."""
         moments = torch.cat([self.encode_moments(chunk) for chunk in image.split(batch_size)])
         posterior = DiagonalGaussianDistribution(moments.repeat_interleave(ensemble_size, dim=0))
         return self.scale_latents(posterior.sample(generator) if sample else posterior.mode())
 
     def encode_moments(self, image: Tensor) -> Tensor:
-        """Mean and logarithm of the variance of an image's latent, as ``self.vae`` gives them."""
+        """Return mean and log variance of an image's latent from ``self.vae``."""
         return self.vae.encode(image).latent_dist.parameters
 
     def scale_latents(self, latents: Tensor) -> Tensor:
-        """Latents of the autoencoder as the network takes them."""
+        """Scale latents of the autoencoder for the network."""
         return latents * self.vae.config.scaling_factor
 
     def prompt_embedding(self, like: Tensor, words: str = "") -> Tensor:
-        """Embedding of a prompt, ``(len(like), n, C)``, not padded, as in Marigold's training."""
+        """Embed a prompt, ``(len(like), n, C)``, not padded, as in Marigold's training."""
         most = self.tokenizer.model_max_length
         tokens = self.tokenizer(words, max_length=most, truncation=True, return_tensors="pt")
         embedding = self.text_encoder(tokens.input_ids.to(like.device))[0]
         return embedding.to(like).expand(len(like), -1, -1)
 
     def run_unet(self, sample: Tensor, timestep: Any, condition: Condition) -> Tensor:
-        """Output of ``self.unet`` with ``condition["prompt"]`` and, if any, ``condition["class_labels"]``."""
+        """Run ``self.unet`` with ``condition["prompt"]`` and, if any, ``condition["class_labels"]``."""
         return self.unet(
             sample,
             timestep,
@@ -302,10 +302,10 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return_dict: bool = True,
         **options: Any,
     ) -> DepthOutput | tuple[Any, ...]:
-        """Estimate relative depth; arguments as ``MarigoldDepthPipeline`` takes them.
+        """Estimate relative depth; arguments as in ``MarigoldDepthPipeline``.
 
-        ``None`` for steps and resolution is the prior's default, for ``resample_method_output`` its authors'
-        choice (bilinear while guided). ``options`` are further arguments, those of ``prepare_condition``.
+        ``None`` for steps and resolution uses the prior's default, for ``resample_method_output`` its
+        authors' choice (bilinear while guided). ``options`` are further arguments of ``prepare_condition``.
         """
         steps, resolution = self._steps_and_resolution(num_inference_steps, processing_resolution)
         resampling = resample_method_output or self.output_resampling
@@ -315,10 +315,10 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         check_choice(resample_method_input, "resample_method_input", RESAMPLING)
         check_choice(resampling, "resample_method_output", RESAMPLING)
         if unknown := set(options) - set(self.call_options()):
-            bad_value("arguments of this prior", f"out of {self.call_options()}", sorted(unknown))
+            bad_value("arguments of this prior", f"among {self.call_options()}", sorted(unknown))
         processor, place = self.image_processor, (self._execution_device, self.dtype)
         padded, padding, size = processor.preprocess(image, resolution, resample_method_input, *place)
-        padded = padded.contiguous()  # (N, 3, H, W); in another layout a network rounds otherwise
+        padded = padded.contiguous()  # (N, 3, H, W); in another layout a network rounds differently
         condition = self.prepare_condition(padded, ensemble_size, batch_size, generator, **options)
         z = self._start(condition, latents, generator)  # (N * E, C, h, w)
         z = self._run_steps(z, condition, steps, batch_size, generator)
@@ -329,7 +329,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
             return processor.pt_to_numpy(maps) if output_type == "np" else maps
 
         maps = torch.cat([self.decode_prediction(chunk) for chunk in z.split(batch_size)])
-        maps, spread = self.put_together(
+        maps, spread = self.combine_members(
             processor.unpad_image(maps, padding), ensemble_size, output_uncertainty, ensembling_kwargs or {}
         )
         output = DepthOutput(
@@ -337,7 +337,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
             uncertainty=None if spread is None else restore(spread),
             latent=z if output_latent else None,
             extras={
-                name: restore(processor.unpad_image(extra, padding), "nearest-exact")  # unit normals stay so
+                name: restore(processor.unpad_image(extra, padding), "nearest-exact")  # keeps unit normals
                 for name, extra in self.decode_extras(z, ensemble_size).items()
             },
         )
@@ -345,13 +345,13 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return output if return_dict else (output.prediction, output.uncertainty, output.latent)
 
     def call_options(self) -> list[str]:
-        """Further arguments of the call: the keywords of this prior's ``prepare_condition``."""
+        """Return further arguments of the call: the keywords of this prior's ``prepare_condition``."""
         common = inspect.signature(DepthDiffusionPipeline.prepare_condition).parameters
         here = inspect.signature(self.prepare_condition).parameters
         return [name for name, p in here.items() if name not in common and p.kind is not p.VAR_KEYWORD]
 
     def _steps_and_resolution(self, steps: int | None, resolution: int | None) -> tuple[int, int]:
-        """Those of the caller, checked, or the prior's own."""
+        """Return the caller's values, checked, or the prior's defaults."""
         steps = self.default_denoising_steps if steps is None else steps
         resolution = self.default_processing_resolution if resolution is None else resolution
         check_number(steps, "num_inference_steps", 1, self.max_steps or 1000, integer=True)
@@ -359,7 +359,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return steps, resolution
 
     def _start(self, condition: Condition, latents: Any, generator: Generators) -> Tensor:
-        """Latents of the caller, checked, or those of ``prepare_latents``."""
+        """Return the caller's latents, checked, or the ones from ``prepare_latents``."""
         if latents is None:
             return self.prepare_latents(condition, generator)
         if not isinstance(latents, Tensor):
@@ -374,7 +374,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
     def _run_steps(
         self, latents: Tensor, condition: Condition, steps: int, batch_size: int, generator: Generators
     ) -> Tensor:
-        """Denoise the members ``(N * E, C, h, w)`` in chunks, each of which is one trajectory."""
+        """Denoise the members ``(N * E, C, h, w)`` in chunks, one trajectory each."""
         done = []
         for i in self.progress_bar(range(0, len(latents), batch_size), leave=True, desc="Depth predictions"):
             z = latents[i : i + batch_size]
@@ -386,7 +386,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
             done.append(z)
         return torch.cat(done)
 
-    def put_together(
+    def combine_members(
         self, maps: Tensor, ensemble_size: int, output_uncertainty: bool, ensembling_kwargs: dict[str, Any]
     ) -> tuple[Tensor, Tensor | None]:
         """Combine the members of every image, ``(N * E, 1, H, W)``, to ``(N, 1, H, W)`` and its spread."""
@@ -401,20 +401,20 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
 
 
 class DirectMapPipeline(DepthDiffusionPipeline):
-    """One step that gives ``condition["image_latent"]``, a map ``(N * E, 1, H, W)``, which guidance moves."""
+    """One step that returns ``condition["image_latent"]``, a map ``(N * E, 1, H, W)`` to be guided."""
 
     max_steps = 1
     deterministic = True
     sees_latents = False
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The map, whatever the latents are."""
+        """Return the map for any latents."""
         return condition["image_latent"]
 
     def decode(self, z0: Tensor) -> Tensor:
-        """The latent is the map."""
+        """Return the latent, which is the map."""
         return z0
 
     def encode(self, x: Tensor) -> Tensor:
-        """The map is the latent."""
+        """Return the map, which is the latent."""
         return x

@@ -1,4 +1,4 @@
-"""Pixel-Perfect Depth: a flow in pixel space with semantic tokens half way (arXiv 2510.07316)."""
+"""Pixel-Perfect Depth: a flow in pixel space with semantic tokens halfway (arXiv 2510.07316)."""
 
 from __future__ import annotations
 
@@ -18,53 +18,53 @@ from torch import Tensor, nn
 from transformers import Dinov2Model
 
 from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, widened
+from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, upcast
 
-#: Sides are multiples of this; one semantic token for each such square.
+#: Sides are multiples of this, pixels; each such square has one semantic token.
 SIDE = 16
 LAST_TIMESTEP = 1000
-#: Shorter over longer side of the training images: 1024 x 768.
+#: Ratio of the shorter to the longer side of the training images: 1024 x 768.
 TRAINING_RATIO = 0.75
-#: Mean of red, green and blue in ImageNet, which the encoder subtracts.
+#: ImageNet mean of red, green and blue, which the encoder subtracts.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
-#: Their standard deviation, by which it divides.
+#: ImageNet standard deviation of red, green and blue, by which the encoder divides.
 IMAGENET_STD = (0.229, 0.224, 0.225)
 #: Base of the rotary embedding.
 ROPE_BASE = 100.0
-#: Size of the embedding of the time.
+#: Size of the time embedding.
 TIME_FREQUENCIES = 256
-#: Keeps norms from 0.
+#: Lower bound of norms.
 NORM_EPS = 1e-6
-#: DINOv2 stretches its position embeddings by (n + 0.1) / old and not by n / old.
+#: DINOv2 scales its position embeddings by (n + 0.1) / old instead of n / old.
 POSITION_OFFSET = 0.1
 
 
 def sampling_timesteps(steps: int) -> list[float]:
-    """1000 and on in steps of 1001 / n, rounded; without the -1 that rounding gives the authors at times."""
+    """Return rounded timesteps from 1000 in steps of 1001 / n, without the authors' occasional -1."""
     step = -(LAST_TIMESTEP + 1) / steps
     times = torch.arange(LAST_TIMESTEP, -1, step, dtype=torch.float32, device="cpu")
     return times.round()[:steps].tolist()
 
 
 class AreaImageProcessor(MarigoldImageProcessor):
-    """Resizes to a given area with sides that are multiples of 16, so that the two axes scale differently."""
+    """Resizes to a given area with sides that are multiples of 16, so the axes have different scales."""
 
     @staticmethod
     def resize_to_max_edge(image: Tensor, max_edge_sz: int, mode: str) -> Tensor:
-        """The image at the area of ``max_edge_sz x 0.75 max_edge_sz``, as the authors shrink and enlarge."""
+        """Resize to the area of ``max_edge_sz x 0.75 max_edge_sz``, with the authors' interpolation modes."""
         height, width = image.shape[-2:]
         scale = (max_edge_sz**2 * TRAINING_RATIO / (height * width)) ** 0.5
         size = tuple(max(SIDE, round(side * scale / SIDE) * SIDE) for side in (height, width))
         if scale < 1 and size[0] <= height and size[1] <= width:
             views = [view.permute(1, 2, 0).float().cpu().numpy() for view in image]
-            shrunk = [cv2.resize(view, size[::-1], interpolation=cv2.INTER_AREA) for view in views]
-            return torch.from_numpy(np.stack(shrunk)).permute(0, 3, 1, 2).to(image)
+            downscaled = [cv2.resize(view, size[::-1], interpolation=cv2.INTER_AREA) for view in views]
+            return torch.from_numpy(np.stack(downscaled)).permute(0, 3, 1, 2).to(image)
         return F.interpolate(image, size, mode="bicubic", align_corners=False).clamp(-1.0, 1.0)
 
 
 @apply_forward_hook
 def semantic_tokens(encoder: Dinov2Model, image_01: Tensor) -> Tensor:
-    """Normed patch tokens ``(B, n, C)`` of Depth Anything V2's encoder, one for each 16 x 16 pixels.
+    """Compute normalized patch tokens ``(B, n, C)`` of Depth Anything V2's encoder, one per 16 x 16 pixels.
 
     The parts of ``encoder.forward`` are called one by one; the hook brings an offloaded encoder back.
     """
@@ -79,7 +79,7 @@ def semantic_tokens(encoder: Dinov2Model, image_01: Tensor) -> Tensor:
 
 
 def _position_embeddings(learned: Tensor, rows: int, columns: int) -> Tensor:
-    """Of the class token and of a grid; transformers leaves the authors' offset out, which moves them all."""
+    """Return embeddings of class token and grid, with the authors' offset, which transformers omits."""
     side = round((learned.shape[1] - 1) ** 0.5)
     if (rows, columns) == (side, side):
         return learned
@@ -90,7 +90,7 @@ def _position_embeddings(learned: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def _rotations(rows: int, columns: int, head_size: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine ``(n, head_size)`` of a grid: half of a head turns with rows, half with columns."""
+    """Compute cosine and sine ``(n, head_size)`` of a grid: half a head for rows, half for columns."""
     row, column, half = (torch.arange(n, device=like.device) for n in (rows, columns, head_size // 2))
     positions = torch.cartesian_prod(row, column)  # (n, 2)
     angles = positions[:, :, None].float() / ROPE_BASE ** (half[::2].float() / len(half))  # (n, 2, half / 2)
@@ -99,15 +99,15 @@ def _rotations(rows: int, columns: int, head_size: int, like: Tensor) -> tuple[T
 
 
 def _rotate(tokens: Tensor, rotations: tuple[Tensor, Tensor]) -> Tensor:
-    """Rotary embedding of ``(B, heads, n, head_size)``."""
+    """Apply the rotary embedding to ``(B, heads, n, head_size)``."""
     cosine, sine = rotations
     halves = tokens.unflatten(-1, (2, 2, -1))  # row and column, each in two parts
-    turned = torch.stack([-halves[..., 1, :], halves[..., 0, :]], dim=-2).flatten(-3)
-    return tokens * cosine + turned * sine
+    rotated = torch.stack([-halves[..., 1, :], halves[..., 0, :]], dim=-2).flatten(-3)
+    return tokens * cosine + rotated * sine
 
 
-def _modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
-    """Normed tokens, scaled and shifted by the time."""
+def _modulate(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """Normalize tokens, then scale and shift them by the time embedding."""
     normed = F.layer_norm(x, x.shape[-1:], eps=NORM_EPS)
     return normed * (1 + scale[:, None]) + shift[:, None]
 
@@ -136,8 +136,8 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor, time: Tensor, rotations: tuple[Tensor, Tensor]) -> Tensor:
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = self.adaLN_modulation(time).chunk(6, dim=1)
-        x = x + gate_a[:, None] * self.attn(_modulated(x, shift_a, scale_a), rotations)
-        return x + gate_m[:, None] * self.mlp(_modulated(x, shift_m, scale_m))
+        x = x + gate_a[:, None] * self.attn(_modulate(x, shift_a, scale_a), rotations)
+        return x + gate_m[:, None] * self.mlp(_modulate(x, shift_m, scale_m))
 
 
 class PixelDiT(ModelMixin, ConfigMixin):
@@ -169,9 +169,9 @@ class PixelDiT(ModelMixin, ConfigMixin):
         )
 
     def forward(self, x: Tensor, semantics: Tensor, timestep: Tensor) -> Tensor:
-        """Velocity ``noise - clean``, ``(B, 1, H, W)``, of noisy depth and image - 0.5, ``x (B, 4, H, W)``.
+        """Predict the velocity ``noise - clean (B, 1, H, W)``; ``x`` is noisy depth and image - 0.5.
 
-        ``semantics`` are ``(B, n, C)``, a token of each coarse patch; ``timestep`` is in [0, 1000].
+        ``semantics`` are ``(B, n, C)``, one token per coarse patch; ``timestep`` is in [0, 1000].
         """
         patch, head_size = self.config.patch_size, self.config.hidden_size // self.config.num_heads
         rows, columns = x.shape[-2] // (2 * patch), x.shape[-1] // (2 * patch)
@@ -184,21 +184,21 @@ class PixelDiT(ModelMixin, ConfigMixin):
         for block in self.blocks[:middle]:
             tokens = block(tokens, time, coarse)
         tokens = self.proj_fusion(torch.cat([tokens, F.normalize(semantics, dim=-1)], dim=-1))
-        # Every coarse token, 4 D wide now, becomes the four fine ones of its patch, two by two.
+        # Every coarse token, now of width 4 D, becomes the four fine tokens of its patch, two by two.
         tokens = tokens.unflatten(2, (2, 2, -1)).unflatten(1, (rows, columns))  # (B, h, w, 2, 2, D)
         tokens = tokens.permute(0, 1, 3, 2, 4, 5).flatten(1, 4)  # (B, 4 n, D)
         for block in self.blocks[middle:]:
             tokens = block(tokens, time, fine)
         shift_and_scale = self.final_layer["adaLN_modulation"](time).chunk(2, dim=1)
-        pixels = self.final_layer["linear"](_modulated(tokens, *shift_and_scale))  # (B, 4 n, patch^2)
+        pixels = self.final_layer["linear"](_modulate(tokens, *shift_and_scale))  # (B, 4 n, patch^2)
         return F.pixel_shuffle(pixels.transpose(1, 2).unflatten(2, (2 * rows, 2 * columns)), patch)
 
 
 class PPDPipeline(DepthDiffusionPipeline):
     """Pixel-Perfect Depth: its latents are depth itself, ``(B, 1, H, W)``, about [-0.5, 0.5].
 
-    ``processing_resolution`` is the longer side that an image of 4:3 gets; others get the same area. The
-    authors run 4 steps, 20 where they measure points.
+    ``processing_resolution`` is the longer side for a 4:3 image; other images get the same area. The authors
+    use 4 steps, or 20 when evaluating points.
     """
 
     model_cpu_offload_seq = "semantic_encoder->dit"
@@ -219,41 +219,41 @@ class PPDPipeline(DepthDiffusionPipeline):
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """A transformer on semantic tokens, beside the encoder that computes them."""
+        """Recognise a transformer on semantic tokens with the encoder that computes them."""
         encoder = layout.config("semantic_encoder")
         return "semantic_size" in layout.config("dit") and encoder.get("model_type") == "dinov2"
 
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
-        """The image in [-0.5, 0.5] and its semantic tokens, one per member."""
+        """Return the image in [-0.5, 0.5] and its semantic tokens, one set per member."""
         tokens = [semantic_tokens(self.semantic_encoder, part / 2 + 0.5) for part in image.split(batch_size)]
         condition = {"image": image / 2, "semantics": torch.cat(tokens)}
         return {name: value.repeat_interleave(ensemble_size, dim=0) for name, value in condition.items()}
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """Gaussian noise of one channel, ``(N * E, 1, H, W)``."""
+        """Draw Gaussian noise of one channel, ``(N * E, 1, H, W)``."""
         return super().prepare_latents({"image_latent": condition["image"][:, :1]}, generator)
 
     def set_timesteps(self, num_inference_steps: int, device: torch.device) -> None:
-        """The authors' own spacing."""
+        """Set the authors' own timestep spacing."""
         timesteps = sampling_timesteps(num_inference_steps)
         sigmas = [t / LAST_TIMESTEP for t in timesteps]
         self.scheduler.set_timesteps(sigmas=sigmas, timesteps=timesteps, device=device)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """Velocity, noise minus clean depth."""
-        joined = torch.cat([latents.to(condition["image"].dtype), condition["image"]], dim=1)
-        return self.dit(joined, condition["semantics"], timestep)
+        """Predict the velocity, noise minus clean depth."""
+        model_input = torch.cat([latents.to(condition["image"].dtype), condition["image"]], dim=1)
+        return self.dit(model_input, condition["semantics"], timestep)
 
     def decode(self, z0: Tensor) -> Tensor:
-        """Clean depth is the map, but for its offset."""
-        return widened(z0) + 0.5
+        """Add the offset to clean depth, which is the map."""
+        return upcast(z0) + 0.5
 
     def encode(self, x: Tensor) -> Tensor:
-        """The map, but for its offset."""
+        """Subtract the offset from the map."""
         return x - 0.5
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
-        """As the authors end: not clipped."""
+        """Decode like the authors, without clipping."""
         return self.decode(latents)

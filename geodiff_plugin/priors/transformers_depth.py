@@ -1,4 +1,4 @@
-"""Depth models of ``transformers`` as priors that answer in one step, prepared without torchvision."""
+"""Depth models of ``transformers`` as one-step priors, with preprocessing that does not need torchvision."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from torch import Tensor
 from transformers import AutoModelForDepthEstimation, PreTrainedModel
 from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES
 
-from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin._internal.checks import bad_value, check_choice
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 
-MODES = {2: "bilinear", 3: "bicubic"}  # of PIL
-#: Whose library resizes without antialiasing.
+MODES = {2: "bilinear", 3: "bicubic"}  # PIL's resampling codes
+#: Models whose library resizes without antialiasing.
 ALIASED = ("ZoeDepth", "DepthPro")
-#: Whose library pads after normalising.
+#: Models whose library pads after normalizing.
 PADDED_LAST = ("DPT", "PromptDepthAnything")
-#: Whose library brings the map to the image's size bilinearly; the others' do so bicubically.
+#: Models whose library resizes the map to the image bilinearly; others do so bicubically.
 BILINEAR = ("DepthPro", "Tipsv2Dpt")
 HALF = (0.5, 0.5, 0.5)
-#: What a processor's file leaves out.
+#: Defaults of entries missing from a processor's file.
 COMMON: dict[str, Any] = {
     "resample": 2,
     "do_resize": True,
@@ -34,7 +34,7 @@ COMMON: dict[str, Any] = {
     "keep_aspect_ratio": False,
     "ensure_multiple_of": 1,
 }
-#: Where processors differ from it.
+#: Processors with other defaults.
 DEFAULTS: dict[str, dict[str, Any]] = {
     "DPT": {"size": 384, "resample": 3},
     "ZoeDepth": {
@@ -51,15 +51,15 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 
 
 class _Grid(NamedTuple):
-    """What an image becomes before a network, in the order of the steps."""
+    """Geometry of an image's preprocessing, in the order of the steps."""
 
-    reflected: tuple[int, int]  # rows and columns that are reflected at each side
-    size: tuple[int, int]  # (h, w) that it is then resized to
-    zeros: list[int]  # pixels of zeros to the left, right, top and bottom of that
+    reflected: tuple[int, int]  # rows and columns of reflection padding on each side
+    size: tuple[int, int]  # (h, w) after resizing
+    zeros: list[int]  # pixels of zero padding on the left, right, top and bottom
 
 
 class Preparation:
-    """Resizing, padding and normalisation of one checkpoint, by the contents of its file."""
+    """Resizing, padding and normalization of one checkpoint, from its preprocessor file."""
 
     def __init__(self, config: dict[str, Any]) -> None:
         file = "of preprocessor_config.json"
@@ -75,7 +75,7 @@ class Preparation:
             bad_value(f"resample {file}", "2 (bilinear) or 3 (bicubic)", self.options["resample"])
         size = self.options["size"]
         if size is not None and not isinstance(size, int) and not {"height", "width"} <= set(size):
-            bad_value(f"size {file}", "a number or a height and a width", size)
+            bad_value(f"size {file}", "a number, or a height and a width", size)
 
     def _grid(self, height: int, width: int) -> _Grid:
         options, rows, columns = self.options, 0, 0
@@ -97,16 +97,16 @@ class Preparation:
         size = self.options["size"]
         target_h, target_w = (size["height"], size["width"]) if isinstance(size, dict) else (size, size)
         scale_h, scale_w = target_h / height, target_w / width
-        if self.options["keep_aspect_ratio"]:  # the side that changes least decides
+        if self.options["keep_aspect_ratio"]:  # use the side that changes least
             scale_h = scale_w = scale_w if abs(1 - scale_w) < abs(1 - scale_h) else scale_h
         multiple = self.options["ensure_multiple_of"]
         h, w = (int(round(side / multiple) * multiple) for side in (scale_h * height, scale_w * width))
         return h, w
 
     def __call__(self, image_01: Tensor) -> Tensor:
-        """What the network is given, ``(B, 3, h, w)`` float32, of images ``(B, 3, H, W)`` in [0, 1].
+        """Preprocess images ``(B, 3, H, W)`` in [0, 1] to the network's input ``(B, 3, h, w)`` float32.
 
-        Within about a grey level of the library's, which rounds to bytes twice.
+        Agrees within about one grey level with the library's, which rounds to bytes twice.
         """
         (rows, columns), size, zeros = self._grid(*image_01.shape[-2:])
         x = F.pad(image_01, (columns, columns, rows, rows), mode="reflect") if rows or columns else image_01
@@ -122,10 +122,10 @@ class Preparation:
             x = (x - mean) / std
         return F.pad(x, zeros)
 
-    def on_the_image(self, values: Tensor, height: int, width: int) -> Tensor:
-        """The network's map ``(B, 1, h, w)`` without what was padded around ``(height, width)``."""
+    def remove_padding(self, values: Tensor, height: int, width: int) -> Tensor:
+        """Remove padding around ``(height, width)`` from the network's map ``(B, 1, h, w)``."""
         (rows, columns), (h, w), (left, right, top, bottom) = self._grid(height, width)
-        if rows or columns:  # in pixels of the image
+        if rows or columns:  # in image pixels
             h, w, left, right, top, bottom = height, width, columns, columns, rows, rows
         if left + right + top + bottom == 0:
             return values
@@ -136,35 +136,35 @@ def _bicubic(values: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(values, size, mode="bicubic", align_corners=False)
 
 
-#: Class names of every model that ``AutoModelForDepthEstimation`` loads, and what TIPSv2's files name.
+#: Class names of all models that ``AutoModelForDepthEstimation`` loads, and the name in TIPSv2's files.
 DEPTH_ARCHITECTURES = frozenset(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values()) | {
     "Tipsv2DptForDensePrediction"
 }
-#: The map of this one is the height of trees above the ground, seen from the air.
+#: Model whose map is canopy height seen from the air, not depth.
 NO_DEPTH = "CHMv2ForDepthEstimation"
-#: The class that takes depths to start from, and gives metres with them.
+#: The class that takes a depth prompt and then predicts metres.
 PROMPTED = "PromptDepthAnythingForDepthEstimation"
 SPACES = ("depth", "disparity")
-#: Weights that DPT's published files lack and no forward reads: the first fusion has nothing to add to.
+#: Weights that DPT's published files lack and no forward pass reads: the first fusion has nothing to add.
 UNREAD = "fusion_stage.layers.0.residual_layer1."
-#: DepthPro's own upper limit on inverse metres.
+#: DepthPro's upper limit of inverse metres.
 NEAREST = 1e4
-#: Its lower limit.
-FARTHEST = 1e-4
-#: What is 1; a few stray pixels shall not press the rest together.
+#: DepthPro's lower limit of inverse metres.
+MIN_DISPARITY = 1e-4
+#: Quantile that is mapped to 1, so that a few outliers do not compress the rest.
 TOP_QUANTILE = 0.98
-#: Least metres of a network's range, whose nearest depth may be 0.
+#: Minimum depth of a network's range, metres, since its nearest depth may be 0.
 NEAREST_M = 1e-3
-#: Least metres between the nearest and the farthest depth of a prompt, which may all be one.
-LEAST_SPAN_M = 1e-6
+#: Minimum difference between nearest and farthest depth of a prompt, metres, since they may be equal.
+MIN_SPAN_M = 1e-6
 PREPARATION_FILES = ("preprocessor_config.json", "processor_config.json")
 
 
 def output_of(model: PreTrainedModel) -> tuple[str, bool]:
-    """What the class of a model predicts: space (``depth`` or ``disparity``) and whether in (inverse) metres.
+    """Return the space that a model's class predicts (depth or disparity), and whether in (inverse) metres.
 
     DPT predicts metres with the projection that only DINOv2's depth heads have, DepthPro only with the head
-    for its field of view, Prompt Depth Anything only once it is given a prompt.
+    for its field of view, Prompt Depth Anything only with a prompt.
     """
     name, config = type(model).__name__.removesuffix("ForDepthEstimation"), model.config
     if name in ("DepthAnything", "DPT"):
@@ -174,31 +174,31 @@ def output_of(model: PreTrainedModel) -> tuple[str, bool]:
         return "depth", name != "PromptDepthAnything"
     if name == "DepthPro":
         return "disparity", bool(config.use_fov_model)
-    cure = "Say what its output is affine in: space='depth' or space='disparity' (--space)."
-    bad_value("the prior", "a depth model whose output is known", type(model).__name__, cure)
+    hint = "Pass the space of its output: space='depth' or space='disparity' (--space)."
+    bad_value("the prior", "a depth model with a known output space", type(model).__name__, hint)
 
 
 def range_of(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Least value and 98 % quantile of maps ``(B, 1, H, W)``, ``(B,)`` each."""
+    """Return minimum and 98 % quantile of maps ``(B, 1, H, W)``, ``(B,)`` each."""
     rows = values.flatten(1)
-    # A quantile of every pixel of a large map is more than torch.quantile takes.
+    # torch.quantile does not support as many values as a large map has.
     high = torch.quantile(rows[:, :: max(1, rows.shape[1] // 1_000_000)], TOP_QUANTILE, dim=1)
     return rows.amin(dim=1), high
 
 
 def unit_range(values: Tensor) -> Tensor:
-    """Maps ``(B, 1, H, W)`` with their least value at 0 and their 98 % quantile at 1; a flat map is 0."""
+    """Scale maps ``(B, 1, H, W)`` from their minimum at 0 to their 98 % quantile at 1; a flat map is 0."""
     low, high = range_of(values)
     span = (high - low).clamp_min(torch.finfo(values.dtype).tiny)
     return (values - low.view(-1, 1, 1, 1)) / span.view(-1, 1, 1, 1)
 
 
 class TransformersDepthPipeline(DirectMapPipeline):
-    """Every model that ``AutoModelForDepthEstimation`` loads, but that of canopy height.
+    """All models that ``AutoModelForDepthEstimation`` loads, except for the one of canopy height.
 
-    ``processing_resolution`` is the longer side of the map, which guidance moves pixel by pixel, 0 for the
-    image's own; ``preparation``, the contents of ``preprocessor_config.json``, says at which size the network
-    works. ``metric``: maps are in metres (inverse metres in disparity space) without a prompt.
+    ``processing_resolution`` is the longer side of the map, which guidance updates pixel by pixel, 0 for the
+    image's own size. ``preparation``, the contents of ``preprocessor_config.json``, defines the network's
+    input size. ``metric``: whether maps are in metres (inverse metres in disparity space) without a prompt.
     """
 
     model_cpu_offload_seq = "model"
@@ -214,7 +214,7 @@ class TransformersDepthPipeline(DirectMapPipeline):
     ) -> None:
         super().__init__()
         if type(model).__name__ == NO_DEPTH:
-            bad_value("prior", "a model of depth", f"{NO_DEPTH}, whose map is the height of trees")
+            bad_value("prior", "a depth model", f"{NO_DEPTH}, which predicts canopy height")
         self.takes_prompt = type(model).__name__ == PROMPTED
         self.prepare = Preparation(preparation or {})
         try:
@@ -223,7 +223,7 @@ class TransformersDepthPipeline(DirectMapPipeline):
             if prediction_type is None:
                 raise
             space, metric = prediction_type, False
-        # A space that the model's class is known for says nothing new: what is saved with it stays metric.
+        # A saved space equal to the known one of the model's class adds nothing: the pipeline stays metric.
         self.metric = metric and prediction_type in (None, space)
         space = check_choice(prediction_type or space, "space", SPACES)
         defaults = space, default_denoising_steps, default_processing_resolution
@@ -232,21 +232,21 @@ class TransformersDepthPipeline(DirectMapPipeline):
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """An architecture that ``AutoModelForDepthEstimation`` knows, alone or as component ``model``."""
+        """Recognise an architecture of ``AutoModelForDepthEstimation``, alone or as component ``model``."""
         configs = layout.config(""), layout.config("model")
         return any(DEPTH_ARCHITECTURES & set(config.get("architectures") or ()) for config in configs)
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> TransformersDepthPipeline:
-        """The model and the preparation of its images, from our folder or as the hub has it."""
+        """Load the model and its preprocessing, from this package's folder or as published on the hub."""
         if layout.index:
             return build_pipeline(cls, layout, dtype, prediction_type=space)
         config = next(filter(None, map(layout.read_json, PREPARATION_FILES)), None)
         if config is None:
-            cure = "Fetch the whole folder anew: without it nobody knows how images are prepared."
-            bad_value(str(layout.folder), f"a folder with {PREPARATION_FILES[0]}", "none", cure)
+            hint = "Download the whole folder again: this file defines how images are preprocessed."
+            bad_value(str(layout.folder), f"a folder with {PREPARATION_FILES[0]}", "none", hint)
         model = load_component(layout, "", AutoModelForDepthEstimation, dtype, unread=UNREAD)
-        preparation = config.get("image_processor", config)  # a processor's file holds that of its images
+        preparation = config.get("image_processor", config)  # may be nested in a processor's file
         return cls(model.requires_grad_(False), DirectScheduler(0), preparation, space)
 
     def prepare_condition(
@@ -257,7 +257,7 @@ class TransformersDepthPipeline(DirectMapPipeline):
         generator: Generators,
         prompt_depth: Tensor | None = None,
     ) -> Condition:
-        """The relative map of every image, ``(N * E, 1, H, W)`` float32.
+        """Predict the relative map of every image, ``(N * E, 1, H, W)`` float32.
 
         ``prompt_depth (N, 1, h, w)``, metres everywhere, is for Prompt Depth Anything.
         """
@@ -278,35 +278,40 @@ class TransformersDepthPipeline(DirectMapPipeline):
         return {"image_latent": unit_range(torch.cat(maps)).repeat_interleave(ensemble_size, dim=0)}
 
     def metres(self, values: Tensor) -> Tensor:
-        """Metres, > 0, of values of a metric map's unit, any shape."""
-        return values if self.config.prediction_type == "depth" else 1.0 / values.clamp(FARTHEST, NEAREST)
+        """Convert values of a metric map to metres, > 0, any shape."""
+        return (
+            values if self.config.prediction_type == "depth" else 1.0 / values.clamp(MIN_DISPARITY, NEAREST)
+        )
 
     @torch.no_grad()
     def predict(self, image_01: Tensor, size: tuple[int, int], prompt_m: Tensor | None = None) -> Tensor:
-        """What the model says of images in [0, 1], in its own unit and not clipped, ``(B, 1, h, w)`` float32.
+        """Run the model on images in [0, 1]; returns its own unit, unclipped, ``(B, 1, h, w)`` float32.
 
-        Resampled to ``size`` as the library's ``post_process_depth_estimation``, without what was padded.
-        With ``prompt_m (B, 1, h', w')``, metres everywhere, of a model that takes a prompt, it is in metres.
+        Resampled to ``size`` like the library's ``post_process_depth_estimation``, without padding. With
+        ``prompt_m (B, 1, h', w')``, metres everywhere, for models that take a prompt, the result is in
+        metres.
         """
-        told: dict[str, Tensor] = {}
+        prompt_arguments: dict[str, Tensor] = {}
         low, span = image_01.new_zeros(1), image_01.new_ones(1)
         if prompt_m is not None:
             if not self.takes_prompt:
-                bad_value("prompt_depth", "left out with this model", "given", f"Only {PROMPTED} takes one.")
-            # From 0 to 1, as the model itself does it, but before half precision rounds the metres.
+                bad_value("prompt_depth", "omitted with this model", "given", f"Only {PROMPTED} takes one.")
+            # Normalized to [0, 1], as the model itself does, but before half precision rounds the metres.
             prompt = prompt_m.to(image_01.device).float()
             low, high = prompt.amin((1, 2, 3), keepdim=True), prompt.amax((1, 2, 3), keepdim=True)
-            span = (high - low).clamp_min(LEAST_SPAN_M)
+            span = (high - low).clamp_min(MIN_SPAN_M)
             prompt = (prompt - low) / span
-            # It divides by the span.
+            # The model divides by the span.
             prompt[:, :, :1, :1] = torch.where(high > low, prompt[:, :, :1, :1], 1.0)
-            told["prompt_depth"] = prompt.to(self.model.dtype)
-        output = self.model(pixel_values=self.prepare(image_01.float()).to(self.model.dtype), **told)
+            prompt_arguments["prompt_depth"] = prompt.to(self.model.dtype)
+        output = self.model(
+            pixel_values=self.prepare(image_01.float()).to(self.model.dtype), **prompt_arguments
+        )
         values = output.predicted_depth.float()[:, None] * span + low  # (B, 1, h', w')
         fov = getattr(output, "field_of_view", None)
         if fov is not None:  # canonical inverse depth -> inverse metres: times width over focal length
             values = values * 2.0 * torch.tan(0.5 * torch.deg2rad(fov.float())).view(-1, 1, 1, 1)
-        values = self.prepare.on_the_image(values, *image_01.shape[-2:])
+        values = self.prepare.remove_padding(values, *image_01.shape[-2:])
         if tuple(values.shape[-2:]) == tuple(size):
             return values
         if self.prepare.kind in BILINEAR:

@@ -1,156 +1,143 @@
-"""Confidence: the probability that a pixel's depth is within 10 % of the truth; photometric error."""
+"""Computes photometric error, and confidence: the probability that a depth is within 10 % of ground truth.
+
+It is conditional on a correct calibration.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._kernels import use_kernel
-from geodiff_plugin._strips import row_strips
-from geodiff_plugin.algorithm.correction import log_depth_at, range_around
+from geodiff_plugin._internal.kernels import has_kernel
+from geodiff_plugin._internal.strips import row_strips
+from geodiff_plugin.algorithm.constants import MAX_PRIOR_ERROR, MIN_PRIOR_ERROR
+from geodiff_plugin.algorithm.match_fitting import log_depth_at, range_around
 from geodiff_plugin.algorithm.terms import match_exposure
-from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
+from geodiff_plugin.cameras import ALL_VALID, Camera, View
+from geodiff_plugin.geometry import image_size, plane_rays, warp_right_to_left
 from geodiff_plugin.matching import Matches, window_mean
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.result.constants import (
+    DEPTH_LOG_ODDS,
+    DISCONTINUITY_RADIUS,
+    FEATURE_RADIUS,
+    HALF_SUPPORT,
+    MAX_CHANGE,
+    MAX_DISCONTINUITY,
+    MAX_REMAINING_ERROR,
+    MAX_RESIDUAL,
+    MIN_CHANGE,
+    MIN_DISCONTINUITY,
+    MIN_REMAINING_ERROR,
+    MIN_RESIDUAL,
+    PSEUDO_CONFIDENCE,
+)
+from geodiff_plugin.result.records import ConfidenceFeatures
 
-#: Confidence is the probability of a relative error below this.
+#: Relative error within which a depth counts as correct for its confidence.
 RIGHT_WITHIN = 0.1
-#: Log-odds, by logistic regression on pairs with truth, every pair weighing the same
-#: (``python -m tests.benchmarks.confidence`` refits them): constant, certainty, closeness of the matches,
-#: steadiness, evenness, and relative spread of the ensemble (by hand: 10 % quarter the odds).
-BY_EVIDENCE = (-2.95, 0.36, 1.04, 0.94, 0.36, -15.0)
-#: A smaller error that is left in a depth makes no difference.
-LEAST_LEFT = 0.0005
-#: Nor does a larger one.
-MOST_LEFT = 0.05
-#: The least error of a prior, in log depth, that matches can measure.
-BEST = 0.01
-#: The error of a useless prior.
-USELESS = 0.5
-#: Half width in px of the window, on the grid of the matches, over which both of the following are means.
-GROUNDS_REACH = 15
-#: Matches that are closer to a depth, in planes, make no difference.
-CLOSE = 0.5
-#: Nor do those that are farther from it.
-FAR = 10.0
-#: Mean confidence of a window that matches as far as that are given beside the found ones: a few may be close
-#: by chance, and where there are none, none is close.
-FEW = 0.02
-#: A smaller change of log depth makes no difference.
-STEADY = 0.005
-#: Nor does a larger one.
-MOVED = 0.2
-#: Half width in px of the window, on the grid of the matches, in which a depth is compared with others: what
-#: is wrong at an edge of depth, and in the strip that it hides, is wrong within some pixels of it.
-EVEN_REACH = 4
-#: A smaller range of log depth in it makes no difference: surfaces slope.
-EVEN = 0.01
-#: Nor does a larger one.
-STEPPED = 0.5
-#: Known share of the matches around a pixel from which on they determine what their support says.
-DETERMINED_FROM = 0.33
-#: Support at which the prior's error is half known: it is measured where there are matches, and a prior that
-#: is right on the street may be wrong on the trees above it.
-HALF_KNOWN = 0.1
+#: ``known_fraction`` of the surrounding matches above which they determine the depth as far as data support
+#: states.
+MIN_DATA_FRACTION = 0.33
 
 
-def determined(known: Tensor, size: tuple[int, int]) -> Tensor:
-    """How far matches determine a depth, ``(1, 1, H, W)`` in [0, 1], by their ``known_share``."""
-    share = (known / DETERMINED_FROM).clamp_max(1.0)
-    return F.interpolate(share, size, mode="bilinear", align_corners=False)
+def data_support(known: Tensor, size: tuple[int, int]) -> Tensor:
+    """Compute data support ``(1, 1, H, W)`` in [0, 1] from the ``known_fraction`` of the matches."""
+    fraction = (known / MIN_DATA_FRACTION).clamp_max(1.0)
+    return F.interpolate(fraction, size, mode="bilinear", align_corners=False)
 
 
-class Grounds(NamedTuple):
-    """What the depth of an image rests on, ``(1, 1, H, W)`` each."""
+def features_of(denoised_m: Tensor, depth_m: Tensor, target: Matches, support: Tensor) -> ConfidenceFeatures:
+    """Compute the confidence features of a depth: data support, match residual, change and discontinuity.
 
-    support: Tensor  # of ``fit_depth``, [0, 1]
-    apart: Tensor  # mean distance of the matches around a pixel from its depth, in planes
-    moved: Tensor  # mean change of log depth around it since the denoising; the fewer matches, the larger
-    stepped: Tensor  # range of log depth around it
-
-
-def grounds_of(denoised_m: Tensor, depth_m: Tensor, target: Matches, support: Tensor) -> Grounds:
-    """What a depth rests on: its support, how near the matches are to it, what corrected it, how even it is.
-
-    Support says how much the matches of a place weigh, not whether they agree. Where they scatter around the
-    depth, or the last fit had to change the denoised map, the depth is often wrong; and so it is beside a
-    step from one surface to another, whose place is uncertain.
+    Data support is the total weight of the matches around a pixel, not their agreement. A depth is often
+    wrong where matches scatter around it or where the last fit changed the denoised map. It is also often
+    wrong next to a depth discontinuity, whose position is uncertain.
 
     Args:
-        denoised_m: ``(1, 1, H, W)`` metres, the map before it was fitted to the matches for the last time.
-        depth_m: as ``denoised_m``, the result.
-        target: the matches and points, on any grid.
-        support: ``(1, 1, H, W)`` in [0, 1], of ``fit_depth``.
+        denoised_m: ``(1, 1, H, W)`` metres, the map before its last fit to the matches.
+        depth_m: like ``denoised_m``, the result.
+        target: matches and points, on any grid.
+        support: ``(1, 1, H, W)`` in [0, 1], from ``fit_depth``.
     """
     log_depth, denoised = (log_depth_at(each_m, target.size) for each_m in (depth_m, denoised_m))
-    grounds = _grounds_on_grid(log_depth, denoised, target)
-    found = F.interpolate(grounds, image_size(support), mode="bilinear")
-    return Grounds(support, *found.split(1, 1))
+    features = _features_on_grid(log_depth, denoised, target)
+    found = F.interpolate(features, image_size(support), mode="bilinear")
+    return ConfidenceFeatures(support, *found.split(1, 1))
 
 
-def _grounds_on_grid(log_depth: Tensor, denoised: Tensor, target: Matches) -> Tensor:
-    """``apart``, ``moved`` and ``stepped`` of ``Grounds``, ``(1, 3, h, w)``, on the grid of the matches."""
-    if use_kernel(log_depth):
-        from geodiff_plugin.result import grounds_kernels as kernels
-
-        return kernels.grounds_on_grid(log_depth, denoised, target)
+@has_kernel("result.kernels.confidence.features_on_grid")
+def _features_on_grid(log_depth: Tensor, denoised: Tensor, target: Matches) -> Tensor:
+    """Compute residual, change and discontinuity, ``(1, 3, h, w)``, on the grid of the matches."""
     planes = (target.inverse_depth - torch.exp(-log_depth)) / target.plane_step.view(-1, 1, 1, 1)
-    weighted = target.confidence * planes.abs().clamp_max(FAR)
+    weighted = target.confidence * planes.abs().clamp_max(MAX_RESIDUAL)
     layers = torch.cat([target.confidence, weighted, (log_depth - denoised).abs()], 1)
-    weight, weighted, moved = window_mean(layers, GROUNDS_REACH).split(1, 1)
-    apart = (weighted + FEW * FAR) / (weight + FEW)
-    # A map that hardly any match could correct is not steady.
+    weight, weighted, change = window_mean(layers, FEATURE_RADIUS).split(1, 1)
+    residual = (weighted + PSEUDO_CONFIDENCE * MAX_RESIDUAL) / (weight + PSEUDO_CONFIDENCE)
+    # A map that hardly any match could change does not count as stable.
     known = target.confidence.clamp_max(1.0).mean((2, 3), keepdim=True)
-    share = known / (known + FEW)
-    moved = moved.clamp(STEADY, MOVED) ** share * MOVED ** (1.0 - share)
-    return torch.cat([apart, moved, range_around(log_depth, EVEN_REACH)], 1)
+    fraction = known / (known + PSEUDO_CONFIDENCE)
+    change = change.clamp(MIN_CHANGE, MAX_CHANGE) ** fraction * MAX_CHANGE ** (1.0 - fraction)
+    return torch.cat([residual, change, range_around(log_depth, DISCONTINUITY_RADIUS)], 1)
 
 
-def depth_evidence(grounds: Grounds, spread: Tensor | None, prior_error: Tensor | None = None) -> Tensor:
-    """Features ``(B, 6, H, W)`` of the logistic model in ``depth_confidence``, whose arguments these are.
+def depth_evidence(
+    features: ConfidenceFeatures, spread: Tensor | None, prior_error: Tensor | None = None
+) -> Tensor:
+    """Compute the features ``(B, 6, H, W)`` of the logistic model in ``depth_confidence``, same arguments.
 
-    They are 1, certainty, closeness, steadiness, evenness and spread. With less support, a pixel's prior
-    error e moves from the measured one towards a useless prior's. Certainty is the log of .05 over the
-    remaining error, ``(1 - support) * e``, closeness that of 10 planes over the distance of the matches,
-    steadiness that of .2 over the correction, and evenness that of .5 over the range of log depth around.
+        In order, they are:
+
+    - the constant 1;
+    - certainty, the log of .05 over the remaining error ``(1 - support) * e``. With less data support, the
+      prior error ``e`` of a pixel moves from the measured value towards the error of a useless prior;
+    - closeness, the log of 10 planes over the match residual;
+    - stability, the log of .2 over the change by the last fit;
+    - evenness, the log of .5 over the range of log depth in the neighbourhood;
+    - the spread of the ensemble, 0 without one.
     """
-    support, apart, moved, stepped = grounds
-    measured = support.new_tensor(USELESS) if prior_error is None else prior_error.clamp(BEST, USELESS)
-    share = support / (support + HALF_KNOWN)
-    left = (1.0 - support) * measured**share * USELESS ** (1.0 - share)
+    support, residual, change, discontinuity = features
+    measured = (
+        support.new_tensor(MAX_PRIOR_ERROR)
+        if prior_error is None
+        else prior_error.clamp(MIN_PRIOR_ERROR, MAX_PRIOR_ERROR)
+    )
+    fraction = support / (support + HALF_SUPPORT)
+    remaining = (1.0 - support) * measured**fraction * MAX_PRIOR_ERROR ** (1.0 - fraction)
     evidence = [
         torch.ones_like(support),
-        -(left.clamp(LEAST_LEFT, MOST_LEFT) / MOST_LEFT).log(),
-        -(apart.clamp(CLOSE, FAR) / FAR).log(),
-        -(moved.clamp(STEADY, MOVED) / MOVED).log(),
-        -(stepped.clamp(EVEN, STEPPED) / STEPPED).log(),
+        -(remaining.clamp(MIN_REMAINING_ERROR, MAX_REMAINING_ERROR) / MAX_REMAINING_ERROR).log(),
+        -(residual.clamp(MIN_RESIDUAL, MAX_RESIDUAL) / MAX_RESIDUAL).log(),
+        -(change.clamp(MIN_CHANGE, MAX_CHANGE) / MAX_CHANGE).log(),
+        -(discontinuity.clamp(MIN_DISCONTINUITY, MAX_DISCONTINUITY) / MAX_DISCONTINUITY).log(),
         torch.zeros_like(support) if spread is None else spread,
     ]
     return torch.cat(evidence, dim=1)
 
 
-def depth_confidence(grounds: Grounds, spread: Tensor | None, prior_error: Tensor | None = None) -> Tensor:
-    """Probability ``(B, 1, H, W)`` that a depth is within 10 % of the truth.
+def depth_confidence(
+    features: ConfidenceFeatures, spread: Tensor | None, prior_error: Tensor | None = None
+) -> Tensor:
+    """Compute the probability ``(B, 1, H, W)`` that a depth is within 10 % of ground truth.
 
-    From what it rests on, the relative spread of an ensemble's members (or ``None``), and the prior's
+    Depends on its features, the relative spread of the ensemble members (or ``None``), and the prior's
     ``local_error`` on any grid (``None`` counts as a useless prior).
     """
-    support = grounds.support
-    size = image_size(support)
     if prior_error is not None and image_size(prior_error) != (1, 1):
-        prior_error = F.interpolate(prior_error, size, mode="nearest-exact")
-    if use_kernel(support):
-        from geodiff_plugin.result import kernels
+        prior_error = F.interpolate(prior_error, image_size(features.support), mode="nearest-exact")
+    return _confidence(features, spread, prior_error)
 
-        return kernels.confidence_of(grounds, spread, prior_error)
-    weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
+
+@has_kernel("result.kernels.confidence.confidence")
+def _confidence(features: ConfidenceFeatures, spread: Tensor | None, prior_error: Tensor | None) -> Tensor:
+    """Compute ``depth_confidence``; ``prior_error`` is one number per map or has the size of the maps."""
+    support = features.support
+    weights = support.new_tensor(DEPTH_LOG_ODDS).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
-    for rows in row_strips(*size):  # the features take six times as much memory as the result
-        part = Grounds(*(x[:, :, rows] for x in grounds))
+    for rows in row_strips(*image_size(support)):  # the features need six times the memory of the result
+        part = ConfidenceFeatures(*(x[:, :, rows] for x in features))
         further = (None if x is None else x.expand_as(support)[:, :, rows] for x in (spread, prior_error))
         confidence[:, :, rows] = torch.sigmoid(
             (weights * depth_evidence(part, *further)).sum(1, keepdim=True)
@@ -158,51 +145,56 @@ def depth_confidence(grounds: Grounds, spread: Tensor | None, prior_error: Tenso
     return confidence
 
 
-def reprojection(
-    views: Sequence[CameraView], depth_m: Tensor, left_01: Tensor, K_left: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Where any native right view sees the pixel, and the least photometric error of the re-rendered image.
+def reprojection(rights: Sequence[View], depth_m: Tensor, left: View) -> tuple[Tensor, Tensor]:
+    """Return where any native right view sees the pixel, and the least photometric error of the warped views.
 
-    ``(1, 1, H, W)`` bool and float in [0, 1], in the left image's exposure, 0 where no view sees the pixel.
+    ``(1, 1, H, W)`` bool and float in [0, 1], in the left image's exposure; the error is 0 where no view sees
+    the pixel. ``left`` has the size of the depth. Invalid pixels of either image are not visible.
     """
     best, visible = None, None
-    for image, K_right, T in views:
-        image, K_right = as_fine_as(image, K_right, K_left[0])
-        warped, seen = _warped(image[None], depth_m, K_left, K_right[None], T[None])
-        error = torch.where(seen, _photometric_error(warped, left_01, seen), torch.inf)
+    for view in rights:
+        view = view.as_fine_as(left.camera)
+        warped, seen = _warped(view, depth_m, left.camera)
+        seen = _visible_and_valid(seen, view, depth_m, left)
+        error = torch.where(seen, _photometric_error(warped, left.image_01[None], seen), torch.inf)
         best = error if best is None else torch.minimum(best, error)
         visible = seen if visible is None else visible | seen
     assert best is not None and visible is not None  # there are views
     return visible, torch.where(visible, best, 0.0)
 
 
-def _photometric_error(warped: Tensor, left_01: Tensor, seen: Tensor) -> Tensor:
-    """Mean absolute difference ``(1, 1, H, W)`` of a warped image, in the left one's exposure."""
-    if use_kernel(seen):
-        from geodiff_plugin.result import exposure_kernels
+def _visible_and_valid(seen: Tensor, view: View, depth_m: Tensor, left: View) -> Tensor:
+    """Restrict visible pixels ``(1, 1, H, W)`` bool to those that are valid in both images."""
+    if left.valid is not None:
+        seen = seen & left.valid
+    if view.valid is None:
+        return seen
+    mask = view.valid.to(view.image_01).expand_as(view.image_01).contiguous()
+    warped, _ = _warped(view._replace(image_01=mask), depth_m, left.camera)
+    return seen & (warped[:, :1] > ALL_VALID)
 
-        return exposure_kernels.photometric_error(warped, left_01, seen)
+
+@has_kernel("result.kernels.reprojection.photometric_error")
+def _photometric_error(warped: Tensor, left_01: Tensor, seen: Tensor) -> Tensor:
+    """Compute the mean absolute difference ``(1, 1, H, W)`` of a warped image, in the left one's exposure."""
     error = torch.zeros_like(warped[:, :1])
-    for layer in range(left_01.shape[1]):  # one by one: a copy of all three counts
+    for layer in range(left_01.shape[1]):  # one by one, to avoid a copy of all three
         channel = slice(layer, layer + 1)
         matched = match_exposure(warped[:, channel], left_01[:, channel], seen)
         error += matched.sub_(left_01[:, channel]).abs_()
     return error.div_(left_01.shape[1])
 
 
-def _warped(
-    right_01: Tensor, depth_m: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The right image on the left grid and where it is visible, in strips of rows to spare memory."""
-    if use_kernel(depth_m):
-        from geodiff_plugin.result import kernels
-
-        return kernels.warped(right_01, depth_m, K_left, K_right, T_right_from_left)
-    warped = right_01.new_empty((1, right_01.shape[1], *image_size(depth_m)))
+@has_kernel("result.kernels.reprojection.warped")
+def _warped(right: View, depth_m: Tensor, left: Camera) -> tuple[Tensor, Tensor]:
+    """Warp the right image to the left grid, in strips to save memory; also returns its visibility."""
+    right_01, (height, width) = right.image_01[None], image_size(depth_m)
+    warped = right_01.new_empty((1, right_01.shape[1], height, width))
     visible = torch.empty_like(depth_m, dtype=torch.bool)
-    for rows in row_strips(*image_size(depth_m)):
-        K_strip = K_left.clone()
-        K_strip[:, 1, 2] -= rows.start
-        part = warp_right_to_left(right_01, depth_m[:, :, rows], K_strip, K_right, T_right_from_left)
+    for rows in row_strips(height, width):
+        strip_m, strip = depth_m[:, :, rows], left.cropped((0, rows.start, width, rows.stop))
+        part = warp_right_to_left(
+            right_01, strip_m, plane_rays(strip_m, [strip], [right.camera], [right.T_right_from_left])
+        )
         warped[:, :, rows], visible[:, :, rows] = part.image, part.visible
     return warped, visible

@@ -1,16 +1,17 @@
-"""An ensemble in metres, reduced pixel by pixel (S5.1); Marigold's own reduction renormalises to [0, 1]."""
+"""Reduces an ensemble in metres per pixel (S5.1); Marigold's own reduction renormalizes to [0, 1]."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
-from geodiff_plugin._checks import check_choice
+from geodiff_plugin._internal.checks import check_choice
 
 
 def ensemble_metric(depth_m: Tensor, reduction: str = "median", lower: bool = False) -> tuple[Tensor, Tensor]:
-    """Reduce members ``(E, 1, H, W)`` metres pixel by pixel to a map and its uncertainty, ``(1, 1, H, W)`` m.
+    """Reduce members ``(E, 1, H, W)`` metres per pixel to a map and its uncertainty, ``(1, 1, H, W)`` m.
 
-    ``"median"`` has the median absolute deviation, ``"mean"`` the standard deviation.
+    The uncertainty of ``"median"`` is the median absolute deviation, and of ``"mean"`` the standard
+    deviation.
     """
     check_choice(reduction, "ensembling_kwargs['reduction']", ("median", "mean"))
     middle = depth_m.mean(0, keepdim=True) if reduction == "mean" else median(depth_m, 0, lower)[None]
@@ -18,7 +19,7 @@ def ensemble_metric(depth_m: Tensor, reduction: str = "median", lower: bool = Fa
 
 
 def spread_around(middle: Tensor, depth_m: Tensor, reduction: str) -> Tensor:
-    """How far members ``(E, 1, H, W)`` lie from a map ``(1, 1, H, W)``, pixel by pixel, metres."""
+    """Compute the spread of members ``(E, 1, H, W)`` around a map ``(1, 1, H, W)`` per pixel, metres."""
     away = depth_m - middle
     if reduction == "mean":
         return away.square().mean(0, keepdim=True).sqrt()
@@ -26,9 +27,9 @@ def spread_around(middle: Tensor, depth_m: Tensor, reduction: str) -> Tensor:
 
 
 def median(x: Tensor, dim: int, lower: bool = False) -> Tensor:
-    """The median along ``dim``, which is dropped: of an even number the mean of the middle two, or the lower.
+    """Compute the median along ``dim``; for even counts the mean of the middle two, or the ``lower`` one.
 
-    ``torch.median``, and so Marigold-DC, takes the lower, which makes metres too near.
+    ``torch.median``, and therefore Marigold-DC, takes the lower one, which biases depth towards the camera.
     """
     count = x.shape[dim]
     if count == 1:

@@ -1,35 +1,30 @@
-"""What a depth map says at a pixel, and between two: points, distances, and how far they may be off."""
+"""Reads points and distances with their errors from depth maps, and reprojects maps into another camera."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
+import torch
 
-from geodiff_plugin._certain import SD_PER_MAD
-from geodiff_plugin._checks import bad_value
-
-#: ``confidence`` is the probability that a depth is within this share of the truth.
-CONFIDENT_WITHIN = 0.1
-#: A lower confidence says no more about the spread than this one does.
-LEAST_CONFIDENCE = 0.05
-#: Nor does a higher one than this.
-MOST_CONFIDENCE = 0.999
+from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin._internal.reprojection import depth_in_camera
+from geodiff_plugin.cameras import Camera, PosedCamera
+from geodiff_plugin.result.sigma import relative_sigma
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What the depth map says at one pixel ``(x, y)``."""
+    """The depth map's value at one pixel ``(x, y)``."""
 
     pixel: tuple[int, int]
     point_m: np.ndarray  # (3,) in the left camera's frame
-    spread: float | None  # standard deviation of the depth as a share of it, if anything tells
+    spread: float | None  # standard deviation relative to the depth, if known
     confidence: float | None  # in [0, 1]
 
     @property
     def depth_m(self) -> float:
-        """z, metres."""
+        """Depth z, metres."""
         return float(self.point_m[2])
 
     @property
@@ -38,29 +33,18 @@ class Reading:
         return None if self.spread is None else self.spread * self.depth_m
 
 
-def _spread(confidence: float | None, uncertainty_m: float | None, depth_m: float) -> float | None:
-    """The larger of what the confidence and the spread of the members say, as a share of the depth."""
-    spreads = []
-    if confidence is not None:
-        bounded = min(max(confidence, LEAST_CONFIDENCE), MOST_CONFIDENCE)
-        # A normal error that is within 10 % with this probability has this standard deviation.
-        spreads.append(CONFIDENT_WITHIN / NormalDist().inv_cdf((1 + bounded) / 2))
-    if uncertainty_m is not None:
-        spreads.append(SD_PER_MAD * uncertainty_m / depth_m)
-    return max(spreads, default=None)
-
-
 def read_pixel(
     depth_m: np.ndarray,
     K: np.ndarray,
     pixel: tuple[int, int],
     confidence: np.ndarray | None = None,
-    uncertainty_m: np.ndarray | None = None,
+    sigma_m: np.ndarray | None = None,
 ) -> Reading:
-    """The point (Eq. 9) that a pixel ``(x, y)`` shows; ``ValueError`` outside the map, and without depth.
+    """Return the point (Eq. 9) at a pixel ``(x, y)``; ``ValueError`` outside the map or without depth.
 
-    ``depth_m`` and ``uncertainty_m``, the median absolute deviation of the members, are ``(H, W)`` metres,
-    ``confidence`` is ``(H, W)`` in [0, 1], ``K`` ``(3, 3)`` in pixels of these maps.
+    ``depth_m`` and ``sigma_m``, its standard deviation, are ``(H, W)`` metres; ``confidence`` is ``(H, W)``
+    in [0, 1]; ``K`` is ``(3, 3)`` in pixels of these maps. Without ``sigma_m``, the standard deviation
+    follows from the confidence alone.
     """
     x, y = (int(v) for v in pixel)
     height, width = depth_m.shape
@@ -68,15 +52,18 @@ def read_pixel(
         bad_value("pixel", f"inside the map of {width}x{height}", (x, y))
     z = float(depth_m[y, x])
     if not (np.isfinite(z) and z > 0):
-        bad_value("pixel", "one with a depth", (x, y))
-    sure, off_m = (None if map is None else float(map[y, x]) for map in (confidence, uncertainty_m))
-    return Reading((x, y), z * (np.linalg.inv(K) @ (x, y, 1.0)), _spread(sure, off_m, z), sure)
+        bad_value("pixel", "a pixel with a depth", (x, y))
+    known, sigma = (None if each is None else float(each[y, x]) for each in (confidence, sigma_m))
+    spread = None if sigma is None or not np.isfinite(sigma) else sigma / z
+    if sigma_m is None and known is not None:
+        spread = float(relative_sigma(np.array(known)))
+    return Reading((x, y), z * Camera(K).rays(np.array([x, y])), spread, known)
 
 
 def distance_m(a: Reading, b: Reading) -> tuple[float, float | None]:
-    """How far two points are from each other, and the standard deviation of that if known, in metres.
+    """Compute the distance between two points and, if known, its standard deviation, metres.
 
-    An error of depth moves a point along its own ray; the errors of the two points are taken as independent.
+    A depth error moves a point along its ray. The errors of the two points are assumed independent.
     """
     between = b.point_m - a.point_m
     length = float(np.linalg.norm(between))
@@ -89,10 +76,32 @@ def distance_m(a: Reading, b: Reading) -> tuple[float, float | None]:
 
 
 def metres(value: float, spread: float | None = None, unit: str | None = "m") -> str:
-    """``2.31 m`` or ``2.31 ± 0.07 m``; to the millimetre where the spread is below half a centimetre.
+    """Format a length as ``2.31 m`` or ``2.31 ± 0.07 m``, with 3 decimals for spreads below 5 mm.
 
-    Lengths without a unit are "units of the poses".
+    Lengths without a unit are in "units of the poses".
     """
     decimals = 3 if spread is not None and spread < 0.005 else 2
     shown = f"{value:.{decimals}f}{'' if spread is None else f' ± {spread:.{decimals}f}'}"
     return f"{shown} {unit or 'units of the poses'}"
+
+
+def reproject(
+    depth: np.ndarray | torch.Tensor, K: np.ndarray | torch.Tensor, camera: PosedCamera
+) -> np.ndarray | torch.Tensor:
+    """Reproject depth maps into another camera, along its z and in the same unit; 0 where it sees none.
+
+    Args:
+        depth: ``(N, H, W, 1)`` numpy or ``(N, 1, H, W)`` torch, 0 where there is no depth.
+        K: ``(N, 3, 3)`` intrinsics of the maps, pixels.
+        camera: the other camera, with ``size (width, height)``.
+
+    Returns:
+        ``(N, height, width, 1)`` numpy or ``(N, 1, height, width)`` torch, float32.
+    """
+    Ks = K if isinstance(K, np.ndarray) else K.numpy(force=True)
+    maps = depth[..., 0] if isinstance(depth, np.ndarray) else depth[:, 0].numpy(force=True)
+    pairs = zip(maps, map(Camera, Ks.astype(np.float64)), strict=True)
+    seen = np.stack([depth_in_camera(each, left, camera) for each, left in pairs])
+    if isinstance(depth, np.ndarray):
+        return seen[..., None]
+    return torch.from_numpy(seen[:, None]).to(depth.device)

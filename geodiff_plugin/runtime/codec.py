@@ -1,6 +1,6 @@
-"""The prior's estimate at one denoising step: clean latent and relative map, decoded and encoded.
+"""Decodes and encodes the prior's estimate at one denoising step: clean latent and relative map.
 
-Maps cover the image on the processing grid, latents also its padding.
+Maps cover the image on the processing grid. Latents also cover its padding.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ import torch.nn.functional as F
 from diffusers import AutoencoderTiny
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_from, z0_from
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.priors.loading import reading
-from geodiff_plugin.runtime.hooks import DenoiserTap, put_channels
+from geodiff_plugin.runtime.hooks import DenoiserHook, put_channels
 
-#: Value of the knob ``decoder`` for the pipeline's own autoencoder.
+#: Value of the parameter ``decoder`` for the pipeline's own autoencoder.
 FULL = "full"
-#: Value of the knob for the tiny autoencoder that is published for its latent.
+#: Value of ``decoder`` for the tiny autoencoder published for the pipeline's latent space.
 TINY = "tiny"
 
 
 class LatentGrid(NamedTuple):
-    """The latent of an autoencoder; ``None`` where its config does not say."""
+    """Size of an autoencoder's latent; ``None`` where its config does not define it."""
 
     channels: int | None
-    cell_px: int | None  # pixels of the image per cell, along a side
+    cell_px: int | None  # image pixels per latent cell, along a side
 
     @classmethod
     def of(cls, vae: Any) -> LatentGrid:
-        """Of an autoencoder of diffusers."""
+        """Read the latent grid from the config of a diffusers autoencoder."""
         config = vae.config
         stages = config.get("decoder_block_out_channels") or config.get("block_out_channels")
         channels = config.get("latent_channels", config.get("z_dim"))
@@ -48,14 +48,14 @@ class LatentGrid(NamedTuple):
 
 
 class TinyAutoencoder(NamedTuple):
-    """A tiny autoencoder that is published, and the latent that it stands in for."""
+    """A published tiny autoencoder and the latent space that it decodes."""
 
     latent: LatentGrid
     scaling_factor: float
     hub_id: str
 
 
-#: The tiny autoencoders of Stable Diffusion 1 and 2, XL and 3, and of FLUX.
+#: Published tiny autoencoders for Stable Diffusion 1, 2, XL and 3, and for FLUX.
 PUBLISHED = (
     TinyAutoencoder(LatentGrid(4, 8), 0.18215, "madebyollin/taesd"),
     TinyAutoencoder(LatentGrid(4, 8), 0.13025, "madebyollin/taesdxl"),
@@ -65,18 +65,18 @@ PUBLISHED = (
 
 
 class StepInputs(NamedTuple):
-    """What the scheduler's step is given, and what is added to its result; ``(B, C, h, w)`` each."""
+    """Inputs of the scheduler's step and the offset added to its result; ``(B, C, h, w)`` each."""
 
-    output: Tensor  # the network's
-    z_t: Tensor  # the noisy latent
-    move: Tensor | None = None
+    output: Tensor  # output of the network
+    z_t: Tensor  # noisy latent
+    offset: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class ProcessingGrid:
-    """The grid that a pipeline denoises on: ``(H, W)`` of the image, and rows and columns of padding.
+    """The grid that a pipeline denoises on: image size ``(H, W)``, and rows and columns of padding.
 
-    ``preprocessed`` is what the image processor returned for the images of the call, if it ran already.
+    ``preprocessed`` is the image processor's output for the images of the call, if it already ran.
     """
 
     content: tuple[int, int]
@@ -89,20 +89,23 @@ class ProcessingGrid:
         return self.content[0] + self.padding[0], self.content[1] + self.padding[1]
 
     def cropped(self, x: Tensor) -> Tensor:
-        """``(B, C, H, W)`` without its padding."""
+        """Crop the padding from ``x (B, C, H, W)``."""
         height, width = self.content
         return x[:, :, :height, :width]
 
     def padded(self, x: Tensor) -> Tensor:
-        """A map, also one that covers whole cells only, extended to the grid by its last row and column."""
+        """Pad ``x`` to the full grid by replicating its last row and column.
+
+        ``x`` may be a map that covers whole latent cells only.
+        """
         bottom, right = (full - side for full, side in zip(self.size, x.shape[-2:], strict=True))
         return F.pad(x, (0, right, 0, bottom), mode="replicate") if bottom or right else x
 
 
 class MapCodec:
-    """A pipeline and its prior as a guided call uses them: it decodes and encodes relative maps on a grid.
+    """Decodes and encodes relative maps with a pipeline and its prior on a processing grid.
 
-    ``tiny`` stands in for the pipeline's VAE.
+    ``tiny`` replaces the pipeline's VAE if given.
     """
 
     def __init__(self, pipe: Any, prior: DepthPrior, grid: ProcessingGrid, tiny: Any | None = None) -> None:
@@ -111,7 +114,7 @@ class MapCodec:
     @contextmanager
     def _autoencoder(self, tiny: Any | None) -> Iterator[None]:
         original = getattr(self.pipe, "vae", None)
-        if tiny is not None:  # past ``__setattr__``, which would rewrite the pipeline's config
+        if tiny is not None:  # bypass ``__setattr__``, which would rewrite the pipeline's config
             object.__setattr__(self.pipe, "vae", tiny)
         try:
             yield
@@ -120,69 +123,68 @@ class MapCodec:
                 object.__setattr__(self.pipe, "vae", original)
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)`` float32 of a clean latent's depth channels, differentiable.
+        """Decode the depth channels of a clean latent to an unclipped relative map ``(B, 1, H, W)`` float32.
 
-        A ``final`` map is the result, so the pipeline's autoencoder decodes it and not the tiny one.
+        Differentiable. A ``final`` map is part of the result, so the pipeline's own autoencoder decodes it.
         """
         with self._autoencoder(None if final else self.tiny):
-            x = self.prior.decode(z0).float()  # float32 even for a prior in float64, as the views are
+            x = self.prior.decode(z0).float()  # float32 even for a float64 prior, like the views
         return self.grid.cropped(self.grid.padded(x))
 
     def encode(self, x: Tensor) -> Tensor:
-        """Clean latent of a relative map ``(B, 1, H, W)``, padded as the image was."""
+        """Encode a relative map ``(B, 1, H, W)`` to a clean latent, padded like the image."""
         with self._autoencoder(self.tiny):
             return self.prior.encode(self.grid.padded(x))
 
 
 def tiny_autoencoder(pipe: Any, decoder: str) -> AutoencoderTiny | None:
-    """The autoencoder that ``decoder`` of ``GuidanceConfig`` names, frozen; ``None`` for the VAE."""
+    """Load the frozen autoencoder named by ``GuidanceConfig.decoder``; ``None`` for the VAE."""
     if decoder == FULL:
         return None
     vae: Any = getattr(pipe, "vae", None)
     latent = None if vae is None else LatentGrid.of(vae)
     if latent is None or latent.cell_px is None:
-        cure = "It has no latent of a single image: it works on pixels, or its autoencoder is for videos."
-        bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(decoder), cure)
+        hint = "This prior has no single-image latent: it works on pixels or uses a video autoencoder."
+        bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(decoder), hint)
     if decoder == TINY:
         decoder = _published(pipe, latent, vae.config.get("scaling_factor"))
     tiny = _loaded(decoder, pipe.dtype, str(pipe._execution_device))
     own = LatentGrid.of(tiny)
     if own != latent:
-        bad_value("decoder", f"of the prior's latent ({latent})", f"{own}, in {decoder!r}")
+        bad_value("decoder", f"an autoencoder with the prior's latent ({latent})", f"{own}, in {decoder!r}")
     return tiny
 
 
 def _published(pipe: Any, latent: LatentGrid, scaling_factor: float | None) -> str:
-    """The hub id of the tiny autoencoder that is published for the latent of a pipeline."""
+    """Return the hub id of the tiny autoencoder published for a pipeline's latent space."""
     for each in PUBLISHED:
         if (each.latent, each.scaling_factor) == (latent, scaling_factor):
             return each.hub_id
-    cure = (
-        f"None is published for its latent of {latent.channels} channels; give a folder or a hub id of one."
-    )
-    bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(TINY), cure)
+    hint = f"No tiny autoencoder is published for {latent.channels} latent channels; pass a folder or hub id."
+    bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(TINY), hint)
 
 
 @lru_cache(maxsize=1)
 def _loaded(name: str, dtype: torch.dtype, device: str) -> AutoencoderTiny:
     if not os.path.isdir(name) and (name.count("/") != 1 or name.startswith((".", "/", "~"))):
-        bad_value("decoder", f"{FULL!r}, {TINY!r}, a folder that is there, or a hub id", repr(name))
-    expected = "a folder of an AutoencoderTiny, or a hub id of one that is cached or can be reached"
-    cure = "Fetch it once with `hf download ID` while online, or give a folder that save_pretrained wrote."
-    with reading("decoder", expected, repr(name), cure):
+        bad_value("decoder", f"{FULL!r}, {TINY!r}, an existing folder, or a hub id", repr(name))
+    expected = "a folder with an AutoencoderTiny, or a hub id that is cached or reachable"
+    hint = "Download it once with `hf download ID`, or pass a folder written by save_pretrained."
+    with reading("decoder", expected, repr(name), hint):
         tiny = AutoencoderTiny.from_pretrained(name, dtype=dtype, use_safetensors=True)
     return tiny.to(device).eval().requires_grad_(False)
 
 
 class StepEstimate:
-    """The ``algorithm.step.Estimate`` of one denoising step.
+    """Estimate of one denoising step; implements ``algorithm.step.Estimate``.
 
-    Made from the network's ``output`` and ``z_t``, ``(B, C, h, w)`` each with all channels, in the pipeline's
-    precision. Guidance moves z_t if there is a ``tap``, else the clean latent. ``latent_is_read`` is false if
-    only the map is needed after this step.
+    Built from the network's ``output`` and ``z_t``, ``(B, C, h, w)`` each with all channels, in the
+    pipeline's precision. With a ``hook`` guidance updates z_t, otherwise the clean latent. ``latent_is_read``
+    is false if only the map is needed after this step.
 
     Attributes:
-        latent: ``(B, c, h, w)`` float32, what guidance moves: z_t ("full") or z0_hat ("denoised").
+        latent: ``(B, c, h, w)`` float32, the tensor that guidance updates: z_t ("full") or z0_hat
+            ("denoised").
         eps: ``(B, c, h, w)`` float32, the predicted noise.
         output: ``(B, c, h, w)`` float32, the network's depth channels.
     """
@@ -193,44 +195,44 @@ class StepEstimate:
         level: NoiseLevel,
         output: Tensor,
         z_t: Tensor,
-        tap: DenoiserTap | None,
+        hook: DenoiserHook | None,
         latent_is_read: bool,
     ) -> None:
-        self._codec, self._level, self._output, self._z_t, self._tap = codec, level, output, z_t, tap
-        self._wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
+        self._codec, self._level, self._output, self._z_t, self._hook = codec, level, output, z_t, hook
+        self._wide = torch.promote_types(z_t.dtype, torch.float32)  # upcast half precision
         self.output, wide_z_t = (x[:, codec.prior.depth_channels].to(self._wide) for x in (output, z_t))
         self.eps = noise_from(self.output, wide_z_t, level)
-        self.latent = z0_from(self.output, wide_z_t, level) if tap is None else tap.leaf
+        self.latent = z0_from(self.output, wide_z_t, level) if hook is None else hook.leaf
         self.encode, self.latent_is_read = codec.encode, latent_is_read
 
     def z0(self, latent: Tensor) -> Tensor:
-        """The clean latent of ``latent``: Tweedie through the network ("full"), or the identity."""
-        if self._tap is None:
+        """Compute the clean latent of ``latent``: Tweedie through the network ("full"), or the identity."""
+        if self._hook is None:
             return latent
-        output = self._tap.output_at(latent)[:, self._codec.prior.depth_channels].to(self._wide)
+        output = self._hook.output_at(latent)[:, self._codec.prior.depth_channels].to(self._wide)
         return z0_from(output, latent, self._level)
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
-        """As ``MapCodec.decode``; a ``final`` map is the result, unless the latent is read."""
+        """Decode as in ``MapCodec.decode``; a ``final`` map is the result unless the latent is read."""
         return self._codec.decode(z0, final and not self.latent_is_read)
 
-    def step_inputs(self, move: Tensor, from_moved: bool) -> StepInputs:
-        """Inputs of the scheduler's step after guidance changes the latent by ``move (B, c, h, w)``.
+    def step_inputs(self, offset: Tensor, from_updated: bool) -> StepInputs:
+        """Compute the scheduler's inputs after guidance adds ``offset (B, c, h, w)`` to the latent.
 
-        With the full gradient and ``from_moved`` the step starts from the moved z_t; without ``from_moved``
-        the move is added to the step's result.
+        With the full gradient and ``from_updated`` the step starts from the updated z_t. Without
+        ``from_updated`` the offset is added to the step's result.
         """
-        moved, prior = (self.latent + move).detach(), self._codec.prior
-        if self._tap is None:
-            output, z_t = output_from(moved, self.eps, self._level)
+        updated, prior = (self.latent + offset).detach(), self._codec.prior
+        if self._hook is None:
+            output, z_t = output_from(updated, self.eps, self._level)
             return StepInputs(self._put(self._output, output), self._put(self._z_t, z_t))
         if prior.max_steps == 1:
-            # The step returns the clean latent: evaluate the network at the moved z_t.
-            return StepInputs(self._tap.output_at(moved).detach(), self._put(self._z_t, moved))
-        if from_moved:
-            return StepInputs(self._output, self._put(self._z_t, moved))
+            # The step returns the clean latent, so evaluate the network at the updated z_t.
+            return StepInputs(self._hook.output_at(updated).detach(), self._put(self._z_t, updated))
+        if from_updated:
+            return StepInputs(self._output, self._put(self._z_t, updated))
         nothing = torch.zeros_like(self._z_t, dtype=self._wide)
-        added = put_channels(nothing, prior.depth_channels, move)
+        added = put_channels(nothing, prior.depth_channels, offset)
         return StepInputs(self._output, self._z_t, added)
 
     def _put(self, whole: Tensor, part: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Switch guidance on a live pipeline on and off, check what cannot be guided, and guide a call (S4)."""
+"""Enables and disables guidance on a live pipeline, and checks and runs guided calls (S4)."""
 
 from __future__ import annotations
 
@@ -14,44 +14,53 @@ from diffusers import DiffusionPipeline, MarigoldDepthPipeline
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
-from geodiff_plugin._compilation import compile_kernels
-from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import BackgroundTask
+from geodiff_plugin._internal.checks import (
+    bad_type,
+    bad_value,
+    captured_warnings,
+    check_choice,
+    check_number,
+    raise_input_error,
+    warn,
+)
+from geodiff_plugin._internal.compilation import compile_kernels
+from geodiff_plugin._internal.kernels import without_kernels
+from geodiff_plugin._internal.threads import BackgroundTask
 from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.algorithm.schedule import count_steps
-from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.evidence.inputs import left_images
-from geodiff_plugin.formats.images import in_stored_pixels
-from geodiff_plugin.messages import Message, distinct
+from geodiff_plugin.evidence.inputs import left_alphas, left_images
+from geodiff_plugin.evidence.plan import EvidencePlan
+from geodiff_plugin.findings import Finding, dedupe
+from geodiff_plugin.formats import in_stored_pixels
 from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
 from geodiff_plugin.result.ensemble import ensemble_metric
 from geodiff_plugin.result.output import MetricDepthOutput, image_labels
 from geodiff_plugin.runtime.codec import MapCodec, ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.graphs import FasterNetworks
-from geodiff_plugin.runtime.hooks import Exclusive, Layers
+from geodiff_plugin.runtime.hooks import Layers, PipelineLock
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
+from geodiff_plugin.trust import NOT_TRUSTED
 
-#: What every stock pipeline's call takes, whatever the prior.
+#: Arguments that every stock pipeline's ``__call__`` takes, for any prior.
 STOCK_ARGUMENTS = (
     *("output_type", "resample_method_input", "resample_method_output", "batch_size", "num_inference_steps"),
     *("processing_resolution", "ensemble_size", "generator", "latents"),
 )
-#: Upper bound on the steps, pixels and members that a call may ask for.
-MOST = 1 << 20
+#: Maximum number of steps, pixels and ensemble members per call.
+MAX_COUNT = 1 << 20
 
-# ``GuidedCall`` is mixed in before a class that has all attributes of a stock pipeline.
+# ``GuidedCall`` is mixed in before a class that provides all attributes of a stock pipeline.
 _Stock: Any = MarigoldDepthPipeline if TYPE_CHECKING else object
 
 
 class GuidedCall(_Stock):
-    """Mixin for a stock pipeline: ``__call__`` takes ``guidance``, and a guided ensemble is in metres."""
+    """Mixin for a stock pipeline: ``__call__`` takes ``guidance`` and then returns metric depth."""
 
     _guided_run: GuidedRun | None = None
-    _faster: FasterNetworks | None = None  # networks of guided calls, of ``graphs=True``
+    _faster: FasterNetworks | None = None  # of guided calls with ``cuda_graphs=True``
     _uses_kernels: bool = True
 
     @torch.no_grad()
@@ -64,50 +73,54 @@ class GuidedCall(_Stock):
         strict: bool = False,
         **kwargs: Any,
     ) -> Any:
-        """The stock call; with ``guidance`` its depth is in metres.
+        """Run the stock call; with ``guidance`` its depth is in metres.
 
         Args:
-            image: left image(s), as the stock call takes them; guided, also in any form of ``right``.
-            *args: as the stock call takes them.
-            guidance: the second view; ``None`` is the stock call, bit for bit.
-            callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
-                if it returns ``latents`` they replace the pipeline's. The other values are those of the last
-                step that was corrected or updated, and ``None`` before the first.
-            strict: a depth that is not trusted, or not judged (``output.verdict``), is an error.
-            **kwargs: as the stock call takes them.
+            image: left image(s) in any form the stock call takes; with guidance also in any form of
+                ``right``.
+            *args: passed to the stock call.
+            guidance: the second view. With ``None`` the call equals the stock call bit for bit.
+            callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``. If
+                it returns ``latents``, they replace the pipeline's. The other values come from the latest
+                guided step and ``None`` before the first.
+            strict: whether to raise an error if a depth is not trusted or not assessed (``output.verdict``).
+            **kwargs: passed to the stock call.
 
         Returns:
-            ``MetricDepthOutput``, or with ``return_dict=False`` (prediction, uncertainty, latent) as stock.
+            ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty,
+            latent).
 
         Raises:
-            InputError: ``guidance`` is no ``GeometryGuidance``; a scheduler or offloading that cannot be
-                guided; an image in a form that is not supported; inputs that do not fit each other.
-            RuntimeError: updates inside ``torch.inference_mode()``, or a call by a hook on a network during a
-                guided call. ``callback_on_step_end`` may call the pipeline, guided or not: it is restored
-                while the callback runs. A call in another thread waits.
+            InputError: ``guidance`` is not a ``GeometryGuidance``, the scheduler or offloading mode cannot be
+                guided, an image has an unsupported form, or inputs do not match each other.
+            RuntimeError: gradient updates inside ``torch.inference_mode()``, or a call from a hook of a
+                network during a guided call. ``callback_on_step_end`` may call the pipeline, guided or not:
+                the pipeline is restored while the callback runs. A call from another thread waits.
         """
         if guidance is None and (callback_on_step_end is not None or strict):
             name = "strict" if callback_on_step_end is None else "callback_on_step_end"
-            bad_value(name, "given together with guidance", "guidance=None")
-        with Exclusive(self, guidance is not None) as held:
+            bad_value(name, "given only with guidance", "guidance=None")
+        with PipelineLock(self, guidance is not None) as held:
             if self._guided_run is not None:
                 raise RuntimeError(
-                    "This pipeline is in the middle of a guided call; call it again from "
-                    "callback_on_step_end, or afterwards, but not from a hook of its networks."
+                    "A guided call of this pipeline is in progress; call it again from "
+                    "callback_on_step_end or after the call, but not from a hook of its networks."
                 )
             if guidance is None:
                 return super().__call__(image, *args, **kwargs)
             _check_guided_call(guidance, callback_on_step_end)
             plain_torch = without_kernels(not self._uses_kernels)
-            with torch.inference_mode(False), torch.no_grad(), plain_torch, noted() as warned:
+            with torch.inference_mode(False), torch.no_grad(), plain_torch, captured_warnings() as warned:
                 call = _bind(super().__call__, image, *args, **kwargs)
                 output, stock = self._call_guided(call, guidance, callback_on_step_end, held, warned)
         labelled = zip(image_labels(len(output.verdicts)), output.verdicts, strict=True)
-        untrusted = " ".join(label + verdict.sentence for label, verdict in labelled if not verdict.trusted)
+        untrusted = " ".join(
+            f"{label}{verdict.summary}" for label, verdict in labelled if not verdict.trusted
+        )
         if strict and untrusted:
-            refuse(untrusted)
+            raise_input_error(untrusted)
         if output.verdict.status == "not trusted":
-            warn(Message("verdict.not-trusted", untrusted), stacklevel=3)
+            warn(Finding(NOT_TRUSTED, untrusted), stacklevel=3)
         output.latent = stock.latent if call["output_latent"] else None
         return output if call["return_dict"] else (output.prediction, output.uncertainty, output.latent)
 
@@ -116,12 +129,12 @@ class GuidedCall(_Stock):
         call: dict[str, Any],
         guidance: GeometryGuidance,
         callback: StepCallback | None,
-        held: Exclusive,
-        warned: Sequence[Message],
+        held: PipelineLock,
+        warned: Sequence[Finding],
     ) -> tuple[MetricDepthOutput, Any]:
-        """The output, and that of the stock call; ``call`` is updated to its final arguments.
+        """Run a guided call; returns its output and the stock output, and updates ``call`` in place.
 
-        ``warned`` is read last, when everything that warns has been done.
+        ``warned`` is read last, after everything that can warn.
         """
         lefts = in_stored_pixels(call["image"]) if guidance.as_stored else call["image"]
         lefts_01 = left_images(lefts)  # (N, 3, H, W)
@@ -138,22 +151,24 @@ class GuidedCall(_Stock):
             call |= _one_member(call)
         device = layers.device or super()._execution_device
         compile_kernels(device, logging.getLogger(__name__).info)
-        call["image"] = lefts_01 = lefts_01.to(device)
         guidance.check_left_images(lefts_01)
-        evidence = BackgroundTask(lambda: _prepared(guidance, lefts_01), device, own_stream=True)
+        lefts_01, guidance = guidance.with_valid_pixels(lefts_01, left_alphas(lefts))
+        call["image"] = lefts_01 = lefts_01.to(device)
+        plans = BackgroundTask(lambda: _plan_evidence(guidance, lefts_01), device, own_stream=True)
         try:
             codec = MapCodec(self, prior, self._processing_grid(call, device), tiny)
             if prior.takes_prompt and call.get("prompt_depth") is None:
-                call["prompt_depth"] = depth_prompt(evidence.result(), guidance.config)
-            run = GuidedRun(codec, guidance, evidence.result, call, rounds, unlocked)
+                evidence = [plan.evidence for plan in plans.result()]
+                call["prompt_depth"] = depth_prompt(evidence, guidance.config)
+            run = GuidedRun(codec, guidance, plans.result, call, rounds, unlocked)
             stock = self._run_stock(run, call)
             with torch.autocast(device.type, enabled=False):
-                return run.output(stock, distinct(guidance.warned, warned)), stock
+                return run.output(stock, dedupe(guidance.findings, warned)), stock
         finally:
-            evidence.close()
+            _close(plans)
 
     def _run_stock(self, run: GuidedRun, call: dict[str, Any]) -> Any:
-        """The stock call within a run."""
+        """Run the stock call inside a guided run."""
         fixed = {"return_dict": True, "output_latent": True, "output_type": "pt"}
         try:
             with run:
@@ -162,10 +177,10 @@ class GuidedCall(_Stock):
             run.release()
 
     def _processing_grid(self, call: dict[str, Any], device: torch.device) -> ProcessingGrid:
-        """The grid that the stock call will denoise on, by the stock preprocessing, which is done once.
+        """Run the stock preprocessing once and return the grid that the stock call will denoise on.
 
-        It reads pictures with channels last, as in a stock call, but with given latents, where Marigold does
-        not accept that. The copy, 144 MB at 12 megapixels, is not kept.
+        Images are channels-last, as in a stock call, unless latents are given: Marigold does not accept that
+        combination. The copy, 144 MB at 12 megapixels, is not kept.
         """
         layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
         image = call["image"].contiguous(memory_format=layout)
@@ -178,52 +193,62 @@ class GuidedCall(_Stock):
 
     @property
     def _execution_device(self) -> torch.device:
-        """As stock, which looks through all layers several times; while guided, where the run is."""
+        """The run's device while guided, otherwise the stock value, found without repeated scans."""
         if self._guided_run is not None:
             return self._guided_run.device
         return Layers.of(self).device or super()._execution_device
 
     def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
-        """Stock progress bars; while guided they are off, because the run shows one bar for all."""
+        """Return the stock progress bar; disabled while guided, since the run shows one bar for all steps."""
         if self._guided_run is None:
             return super().progress_bar(iterable, total, **kwargs)
         return tqdm(iterable, total=total, disable=True)
 
     def decode_prediction(self, pred_latent: Tensor) -> Tensor:
-        """Stock decode; while guided, metres instead of the clipped relative map."""
+        """Decode as in the stock pipeline; while guided, to metres instead of the clipped relative map."""
         if self._guided_run is None:
             return super().decode_prediction(pred_latent)
         return self._guided_run.metric_prediction(pred_latent)
 
     def ensemble_depth(self, depth: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
-        """Stock ensembling; while guided, the median of members that are in metres already."""
+        """Ensemble as in the stock pipeline; while guided, take the median of metric members."""
         if self._guided_run is None:
             return super().ensemble_depth(depth, *args, **kwargs)
         lower = self._guided_run.config.even_ensemble == "lower"
         return ensemble_metric(depth, kwargs.get("reduction", "median"), lower)
 
-    def put_together(self, maps: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
-        """The prior's way to combine ensembles; while guided, ``ensemble_depth`` for every image."""
+    def combine_members(self, maps: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
+        """Combine ensembles as the prior does; while guided, with ``ensemble_depth`` for every image."""
         if self._guided_run is None:
-            return super().put_together(maps, *args, **kwargs)
-        return DepthDiffusionPipeline.put_together(self, maps, *args, **kwargs)
+            return super().combine_members(maps, *args, **kwargs)
+        return DepthDiffusionPipeline.combine_members(self, maps, *args, **kwargs)
 
     def save_pretrained(self, *args: Any, **kwargs: Any) -> None:
         """Save the stock pipeline, so that the folder loads without this package."""
-        with Exclusive(self, guided=False):
+        with PipelineLock(self, guided=False):
             twin = copy.copy(self)
         twin.__class__ = _stock_class(type(self))
         twin.save_pretrained(*args, **kwargs)
 
 
-def _prepared(guidance: GeometryGuidance, lefts_01: Tensor) -> list[Evidence]:
-    """Act 1, in float32 whatever the user's autocast."""
+def _plan_evidence(guidance: GeometryGuidance, lefts_01: Tensor) -> list[EvidencePlan]:
+    """Run act 1 in float32, independent of the user's autocast."""
     with torch.autocast(lefts_01.device.type, enabled=False):
-        return guidance.evidence_of(lefts_01)
+        return guidance.plan_evidence(lefts_01)
+
+
+def _close(plans: BackgroundTask[list[EvidencePlan]]) -> None:
+    """Wait until all work of act 1 has ended, even if its result was not needed.
+
+    The caller's stream waits as well, so that memory still being read is not reused.
+    """
+    if not plans.failed:
+        for plan in plans.result():
+            plan.close()
 
 
 def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
-    """All arguments of the stock call by name, with defaults and those that a prior adds."""
+    """Return all arguments of the stock call by name, with defaults and the prior's own arguments."""
     signature = inspect.signature(stock_call)
     bound = signature.bind(*args, **kwargs)
     bound.apply_defaults()
@@ -235,50 +260,52 @@ def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str
 
 
 def _check_named_arguments(pipeline: type) -> None:
-    """Refuse a subclass whose ``__call__`` does not name the arguments of the stock pipeline."""
+    """Raise an error for a subclass whose ``__call__`` does not name the stock arguments."""
     named = inspect.signature(pipeline.__call__).parameters
     if missing := [name for name in STOCK_ARGUMENTS if name not in named]:
-        refuse(
-            f"The __call__ of {pipeline.__name__} must name the arguments of the stock pipeline that it "
-            f"overrides; it has no {', '.join(missing)}. A **kwargs that hands them on hides them: "
-            "write them out."
+        raise_input_error(
+            f"{pipeline.__name__}.__call__ must name the arguments of the stock pipeline that it overrides; "
+            f"missing: {', '.join(missing)}. Write them out: **kwargs hides them."
         )
 
 
 def _check_guided_call(guidance: Any, callback: Any) -> None:
     if not isinstance(guidance, GeometryGuidance):
-        bad_type("guidance", "a GeometryGuidance", guidance, "Make one: GeometryGuidance(right, K, E).")
+        bad_type("guidance", "a GeometryGuidance", guidance, "Create one with GeometryGuidance(right, K, E).")
     if callback is not None and not callable(callback):
         bad_type("callback_on_step_end", "a function", callback)
-    if torch.is_inference_mode_enabled() and guidance.updates.inner_steps > 0:
+    if torch.is_inference_mode_enabled() and guidance.updates.guidance_steps > 0:
         raise RuntimeError(
-            "Gradient updates (inner_steps) are not possible under torch.inference_mode(); "
-            "use torch.no_grad() or nothing."
+            "Gradient updates (guidance_steps) are not possible under torch.inference_mode(); "
+            "use torch.no_grad() or no context."
         )
 
 
 def count_guided_steps(pipe: Any, guidance: GeometryGuidance, requested: int | None) -> tuple[int, int]:
-    """Denoising steps of a guided call, of which the user ``requested`` so many, and rounds in each."""
+    """Return the number of denoising steps of a guided call and of guidance rounds per step.
+
+    ``requested`` is the number that the user asked for, or ``None``.
+    """
     wanted = guidance.denoising_steps(requested, pipe.default_denoising_steps)
     return count_steps(wanted, requested, prior_of(pipe).max_steps)
 
 
 def _check_arguments(call: Mapping[str, Any], images: int) -> None:
-    """Refuse arguments that no pipeline takes; ``images`` is the number of left images."""
+    """Check the arguments common to all pipelines; ``images`` is the number of left images."""
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
     check_choice(call["resample_method_output"] or "bilinear", "resample_method_output", RESAMPLING)
-    for name, least in (("num_inference_steps", 1), ("processing_resolution", 0)):
+    for name, minimum in (("num_inference_steps", 1), ("processing_resolution", 0)):
         if call[name] is not None:
-            check_number(call[name], name, least, MOST, integer=True)
+            check_number(call[name], name, minimum, MAX_COUNT, integer=True)
     for name in ("batch_size", "ensemble_size"):
-        check_number(call[name], name, 1, MOST, integer=True)
+        check_number(call[name], name, 1, MAX_COUNT, integer=True)
     given, members = call["generator"], images * call["ensemble_size"]
     generators = given if isinstance(given, list) else [given]
     if given is not None and not all(isinstance(each, torch.Generator) for each in generators):
         bad_type("generator", "None, a torch.Generator or a list of them", given)
     if isinstance(given, list) and len(given) != members:
-        expected = f"a torch.Generator, or a list of {members}: one for every image and member"
+        expected = f"a torch.Generator, or a list of {members}, one per image and ensemble member"
         bad_value("generator", expected, f"a list of {len(given)}")
     latents = call["latents"]
     if isinstance(latents, Tensor) and not latents.isfinite().all():
@@ -286,50 +313,50 @@ def _check_arguments(call: Mapping[str, Any], images: int) -> None:
 
 
 def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance, layers: Layers) -> None:
-    """Refuse a pipeline whose scheduler, offloading, casting or network cannot be guided as configured."""
+    """Raise an error if the scheduler, offloading, casting or network cannot be guided as configured."""
     check_scheduler(pipe.scheduler)
     full = guidance.config.gradient == "full"
     for network, layer in layers.hooked:
-        differentiated = guidance.moves_latents and (full or network is getattr(pipe, "vae", None))
-        _check_weights_stay(type(network).__name__, layer, differentiated)
+        needs_gradient = guidance.moves_latents and (full or network is getattr(pipe, "vae", None))
+        _check_weights_stay(type(network).__name__, layer, needs_gradient)
     if full and getattr(pipe, "_all_hooks", None):
         expected = "'denoised' with enable_model_cpu_offload()"
-        cure = "Decoding pushes the U-Net to the CPU before its backward pass; use gradient='denoised' or "
-        bad_value("gradient", expected, "'full'", cure + "pipe.to(device).")
+        hint = "Decoding moves the U-Net to the CPU before its backward pass; use gradient='denoised' or "
+        bad_value("gradient", expected, "'full'", hint + "pipe.to(device).")
     if guidance.through_network and prior.network_input is None:
-        cure = "z_t is no input of its network, so only the clean latent can be moved."
-        bad_value("gradient", "'denoised' with this prior", "'full'", cure)
+        hint = "z_t is not an input of its network, so only the clean latent can be updated."
+        bad_value("gradient", "'denoised' with this prior", "'full'", hint)
 
 
-def _check_weights_stay(name: str, module: torch.nn.Module, differentiated: bool) -> None:
-    """Refuse hooks that offload or cast weights before a backward pass needs them."""
+def _check_weights_stay(name: str, module: torch.nn.Module, needs_gradient: bool) -> None:
+    """Raise an error for hooks that offload or cast weights before the backward pass needs them."""
     registry, hook = vars(module).get("_diffusers_hook"), vars(module).get("_hf_hook")
     of_diffusers = "" if registry is None else " ".join(registry.hooks)
     of_accelerate = [h for h in getattr(hook, "hooks", [hook]) if type(h).__name__ == "AlignDevicesHook"]
     if any(h.offload for h in of_accelerate) or "group_offloading" in of_diffusers:
         expected = "without sequential or group CPU offloading while guided"
-        cure = "The backward pass needs them: use pipe.enable_model_cpu_offload() or pipe.to(device)."
-        bad_value("pipe", expected, f"{name} whose weights leave the device after each forward", cure)
-    if differentiated and "layerwise_casting" in of_diffusers:
-        cure = "Leave inner_steps at 0, or load the pipeline in half precision."
-        got = f"{name} whose weights are cast after each layer"
-        bad_value("pipe", "without layerwise casting where gradients go through", got, cure)
+        hint = "The backward pass needs them: use pipe.enable_model_cpu_offload() or pipe.to(device)."
+        bad_value("pipe", expected, f"{name}, whose weights leave the device after each forward pass", hint)
+    if needs_gradient and "layerwise_casting" in of_diffusers:
+        hint = "Set guidance_steps=0, or load the pipeline in half precision."
+        got = f"{name}, whose weights are cast after each layer"
+        bad_value("pipe", "without layerwise casting of differentiated networks", got, hint)
 
 
 def _one_member(call: dict[str, Any]) -> dict[str, Any]:
-    """The arguments to change so that a prior that always gives the same map runs one member only."""
+    """Return the changed arguments that run a single member of a deterministic prior."""
     first = slice(None, None, call["ensemble_size"])
     changed = {"ensemble_size": 1, "output_uncertainty": False}
     for name, kind in (("generator", list), ("latents", Tensor)):
         if isinstance(call[name], kind):
             changed[name] = call[name][first]
-    sentence = "This prior gives the same map every time: only one member runs."
-    warn(Message("prior.one-member", sentence), stacklevel=5)
+    sentence = "This prior is deterministic, so only one ensemble member runs."
+    warn(Finding("prior.one-member", sentence), stacklevel=5)
     return changed
 
 
 class GuidedMarigoldDepthPipeline(GuidedCall, MarigoldDepthPipeline):
-    """``MarigoldDepthPipeline`` whose call takes ``guidance``; ``from_pretrained`` as always.
+    """``MarigoldDepthPipeline`` whose call takes ``guidance``; ``from_pretrained`` is unchanged.
 
     >>> pipe = GuidedMarigoldDepthPipeline.from_pretrained("prs-eth/marigold-depth-v1-1")
     >>> depth_m = pipe(left, guidance=GeometryGuidance(right, K, E)).prediction
@@ -337,7 +364,7 @@ class GuidedMarigoldDepthPipeline(GuidedCall, MarigoldDepthPipeline):
 
 
 def _stock_class(guided: type) -> type:
-    """The class that ``GuidedCall`` was mixed into."""
+    """Return the class that ``GuidedCall`` was mixed into."""
     return next(c for c in guided.__mro__ if not issubclass(c, GuidedCall))
 
 
@@ -349,30 +376,30 @@ def _guided_class(stock: type) -> type:
 
 
 def enable_geometry_guidance(
-    pipe: DiffusionPipeline, *, graphs: bool | None = None, kernels: bool | None = None
+    pipe: DiffusionPipeline, *, cuda_graphs: bool | None = None, kernels: bool | None = None
 ) -> DiffusionPipeline:
-    """Let a live pipeline take ``guidance=``; nothing else about it changes. Returns the same object.
+    """Let a live pipeline accept ``guidance=``. Returns the same object, otherwise unchanged.
 
-    An option that is left out stays as it is, at first ``graphs=False`` and ``kernels=True``; calls without
-    ``guidance`` heed neither.
+    An omitted option keeps its value, initially ``cuda_graphs=False`` and ``kernels=True``. Calls without
+    ``guidance`` ignore both.
 
     Args:
         pipe: a pipeline of a prior in ``PRIORS``.
-        graphs: guided calls on CUDA run U-Net and VAE as CUDA graphs, recorded at the second call of a size,
-            and the group norms of a VAE in half precision by a kernel, equal within rounding. Each graph
-            holds memory of its own. Where gradients go through a network it runs as always.
-        kernels: stages run by Triton kernels where there are some; ``False``: by their references.
+        cuda_graphs: whether guided calls on CUDA run the U-Net and VAE as CUDA graphs, recorded at the second
+            call of each size, and the VAE's half-precision group norms with a Triton kernel, equal within
+            rounding. Each graph holds its own memory. Networks that gradients pass through run eagerly.
+        kernels: whether to run Triton kernels where they exist; ``False`` runs their references.
 
     Raises:
-        InputError: no adapter in ``PRIORS`` understands it, or its call hides the stock arguments; ``graphs``
-            with offloading.
+        InputError: no adapter in ``PRIORS`` supports the pipeline, its ``__call__`` hides the stock
+            arguments, or ``cuda_graphs`` is combined with offloading.
     """
     prior_of(pipe)
-    faster = FasterNetworks(pipe) if graphs else None
+    faster = FasterNetworks(pipe) if cuda_graphs else None
     if not isinstance(pipe, GuidedCall):
         _check_named_arguments(type(pipe))
         pipe.__class__ = _guided_class(pipe.__class__)
-    if graphs is not None:
+    if cuda_graphs is not None:
         pipe._faster = faster
     if kernels is not None:
         pipe._uses_kernels = kernels
@@ -380,7 +407,7 @@ def enable_geometry_guidance(
 
 
 def disable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
-    """Undo ``enable_geometry_guidance``; on a pipeline that is not enabled it does nothing."""
+    """Undo ``enable_geometry_guidance``; does nothing if guidance is not enabled."""
     if isinstance(pipe, GuidedCall):
         pipe.__class__ = _stock_class(type(pipe))
         for name in {"_faster", "_uses_kernels"} & set(vars(pipe)):

@@ -1,7 +1,7 @@
-"""What a guided call changes on a live pipeline, and restores: scheduler, network, ``requires_grad``.
+"""Changes to a live pipeline during a guided call, each restored afterwards.
 
-Each context manager restores the pipeline at exit and can be entered again: while a callback runs the
-pipeline is as the user left it. The guided ``step`` is the DDIM line of Algorithm 1.
+Each context manager restores the pipeline at exit and can be re-entered: while a callback runs, the pipeline
+is as the user left it. The guided ``step`` is the DDIM line of Algorithm 1.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ import torch
 from diffusers import DDIMScheduler
 from torch import Tensor
 
-from geodiff_plugin._threads import WithinCores
+from geodiff_plugin._internal.threads import WithinCores
 from geodiff_plugin.runtime.noise_levels import trailing_timesteps
 
 _Answer = TypeVar("_Answer")
 _LOCKS: WeakKeyDictionary[Any, threading.RLock] = WeakKeyDictionary()
 _LOCKS_GUARD = threading.Lock()
-#: Attributes of a layer in which accelerate and diffusers keep their hooks.
+#: Layer attributes in which accelerate and diffusers store their hooks.
 HOOKS = frozenset({"_hf_hook", "_diffusers_hook"})
 
 
 def put_channels(whole: Tensor, channels: slice, part: Tensor) -> Tensor:
-    """``whole (B, C, h, w)`` with ``part (B, c, h, w)`` at ``channels``, ``part`` itself if these are all."""
+    """Replace ``channels`` of ``whole (B, C, h, w)`` by ``part (B, c, h, w)``; ``part`` itself if c = C."""
     start, stop, _ = channels.indices(whole.shape[1])
     if stop - start == whole.shape[1]:
         return part
@@ -39,7 +39,7 @@ def put_channels(whole: Tensor, channels: slice, part: Tensor) -> Tensor:
 
 @contextmanager
 def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Set an attribute of the instance ``owner``, and restore it at exit."""
+    """Set an attribute of the instance ``owner`` and restore it at exit."""
     before = vars(owner).get(name)
     setattr(owner, name, value)
     try:
@@ -53,7 +53,7 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 @contextmanager
 def frozen_weights(pipe: Any) -> Iterator[None]:
-    """Switch ``requires_grad`` off for every weight of a pipeline, so that no graph is kept for them."""
+    """Disable ``requires_grad`` for every weight of a pipeline, so that no graph is kept for them."""
     thawed = [weight for weight in Layers.of(pipe).weights if weight.requires_grad]
     for weight in thawed:
         weight.requires_grad_(False)
@@ -65,14 +65,15 @@ def frozen_weights(pipe: Any) -> Iterator[None]:
 
 
 def networks_of(pipe: Any) -> list[torch.nn.Module]:
-    """The components of a pipeline that have weights."""
+    """Return the components of a pipeline that are torch modules."""
     return [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
 
 
 def layers_of(network: torch.nn.Module) -> list[torch.nn.Module]:
-    """What ``network.modules()`` gives, each once, in some order.
+    """Return the modules of ``network.modules()``, each once, in arbitrary order.
 
-    Its generators, nested as deep as the layers, take ten times as long: milliseconds in which a GPU waits.
+    ``modules()`` nests one generator per level and takes ten times as long: milliseconds during which a GPU
+    idles.
     """
     found, queue = dict[int, torch.nn.Module](), [network]
     while queue:
@@ -84,18 +85,18 @@ def layers_of(network: torch.nn.Module) -> list[torch.nn.Module]:
 
 
 def weights_of(layers: Iterable[torch.nn.Module]) -> list[torch.nn.Parameter]:
-    """The parameters of layers, each once."""
+    """Return the parameters of layers, each once."""
     weights = (weight for layer in layers for weight in layer._parameters.values() if weight is not None)
     return list({id(weight): weight for weight in weights}.values())
 
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """What a call needs to know of the layers of a pipeline, which it looks through once.
+    """Properties of a pipeline's layers, collected in a single scan per call.
 
     Attributes:
-        weights: their parameters, each once.
-        hooked: the layers that diffusers or accelerate has put hooks on, each with its network.
+        weights: parameters of all layers, each once.
+        hooked: pairs (network, layer) for layers with hooks of diffusers or accelerate.
     """
 
     weights: list[torch.nn.Parameter]
@@ -103,14 +104,14 @@ class Layers:
 
     @classmethod
     def of(cls, pipe: Any) -> Layers:
-        """Of all networks of a pipeline."""
+        """Scan all networks of a pipeline."""
         layers = [(network, layer) for network in networks_of(pipe) for layer in layers_of(network)]
         hooked = [each for each in layers if not HOOKS.isdisjoint(vars(each[1]))]
         return cls(weights_of(layer for _, layer in layers), hooked)
 
     @property
     def device(self) -> torch.device | None:
-        """Where all weights lie; ``None`` if not in one place, or if hooks may move them."""
+        """Device of all weights; ``None`` if they are on several devices or if hooks may move them."""
         devices = set() if self.hooked else {weight.device for weight in self.weights}
         return devices.pop() if len(devices) == 1 else None
 
@@ -118,10 +119,10 @@ class Layers:
 def images_in_float32(
     processor: Any, seen: Any = None, preprocessed: Any = None
 ) -> AbstractContextManager[None]:
-    """Let an image processor work in float32: float16 cannot hold the white of a 16-bit image, 65535.
+    """Make an image processor work in float32: float16 cannot represent 65535, the white of a 16-bit image.
 
-    ``preprocessed`` is what ``preprocess`` returned for the image ``seen`` with the arguments of the call, if
-    it ran already.
+    ``preprocessed`` is the output of ``preprocess`` for the image ``seen`` with the arguments of the call, if
+    it already ran.
     """
     stock = processor.preprocess
 
@@ -140,19 +141,19 @@ def images_in_float32(
     return replaced(processor, "preprocess", preprocess)
 
 
-class Exclusive:
-    """Locks of a call: on its pipeline, and of a guided call also on the networks and the CPU threads."""
+class PipelineLock:
+    """Locks for a call: on its pipeline and, if guided, also on the networks and the CPU threads."""
 
     def __init__(self, pipe: Any, guided: bool) -> None:
         owners = [pipe, *networks_of(pipe)] if guided else [pipe]
         with _LOCKS_GUARD:
             locks = {id(lock): lock for lock in (_LOCKS.setdefault(o, threading.RLock()) for o in owners)}
-        # All threads take them in the same order, so that no two wait for each other.
+        # All threads acquire the locks in the same order, so that no deadlock is possible.
         self._contexts: list[Any] = [lock for _, lock in sorted(locks.items())]
         self._contexts += [WithinCores()] if guided else []
         self._stack = ExitStack()
 
-    def __enter__(self) -> Exclusive:
+    def __enter__(self) -> PipelineLock:
         with ExitStack() as stack:
             for context in self._contexts:
                 stack.enter_context(context)
@@ -163,7 +164,7 @@ class Exclusive:
         self._stack.close()
 
     def released_during(self, function: Callable[..., _Answer]) -> Callable[..., _Answer]:
-        """The function, called with all locks released; it takes them again before it returns."""
+        """Wrap a function so that it runs with all locks released and reacquires them before it returns."""
 
         def unlocked(*args: Any, **kwargs: Any) -> _Answer:
             self.__exit__()
@@ -175,61 +176,62 @@ class Exclusive:
         return unlocked
 
 
-class DenoiserTap:
-    """Runs the network with gradients to its depth latent, and can rerun it at another latent.
+class DenoiserHook:
+    """Forward hook: runs the network with a gradient to its depth latent, and again at other latents.
 
-    An attribute of the instance ``owner`` overrides its ``method`` and calls it, so hooks and compiled
-    forwards still run. ``channels`` of the method's first argument are the depth latent.
-    Source: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
+    An instance attribute of ``owner`` overrides its ``method`` and calls it, so other hooks and compiled
+    forward methods still run. ``channels`` of the method's first argument are the depth latent.
+
+    Source: the gradient with respect to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
     """
 
     def __init__(self, owner: Any, method: str, channels: slice) -> None:
         self._owner, self._method, self._channels = owner, method, channels
-        self._at: Callable[[Tensor], Any] | None = None  # repeats the latest call at another latent
+        self._rerun: Callable[[Tensor], Any] | None = None  # repeats the latest call at another latent
         self._leaf: Tensor | None = None
         self._output: Tensor | None = None
 
     @contextmanager
     def attached(self) -> Iterator[None]:
-        """Override the method; at exit restore it and drop the graph."""
+        """Override the method; restore it and drop the graph at exit."""
         stock, thread = getattr(self._owner, self._method), threading.get_ident()
 
         @functools.wraps(stock)
-        def tapped(model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() != thread:  # a stock call of another pipeline with the same network
+        def hooked_method(model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != thread:  # stock call of another pipeline that shares the network
                 return stock(model_input, *args, **kwargs)
             return self._run(stock, model_input, *args, **kwargs)
 
         try:
-            with replaced(self._owner, self._method, tapped):
+            with replaced(self._owner, self._method, hooked_method):
                 yield
         finally:
             self.release()
 
     @property
     def leaf(self) -> Tensor:
-        """``(B, C, h, w)`` the latest call's depth latent, float32 or wider, requires a gradient."""
+        """Depth latent ``(B, C, h, w)`` of the latest call, float32 or wider, requires a gradient."""
         assert self._leaf is not None
         return self._leaf
 
     def release(self) -> None:
         """Drop the graph."""
-        self._at = self._leaf = self._output = None
+        self._rerun = self._leaf = self._output = None
 
     def _run(self, forward: Callable[..., Any], model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
-        """Call the network: same result, detached; the graph is kept until ``release``."""
+        """Call the network with the same result, detached; the graph is kept until ``release``."""
         model_input = model_input.detach()
         wide = torch.promote_types(model_input.dtype, torch.float32)
         kind = model_input.device.type
         mixed, precision = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
 
         def at(z_t: Tensor) -> Any:
-            # Guided steps leave the user's autocast, under which the other arguments were made.
+            # Guided steps run outside the user's autocast, in which the other arguments were made.
             with torch.enable_grad(), torch.autocast(kind, precision, enabled=mixed):
-                joined = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
-                return forward(joined, *args, **kwargs)
+                spliced = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
+                return forward(spliced, *args, **kwargs)
 
-        self._at, self._leaf = at, model_input[:, self._channels].to(wide).requires_grad_()
+        self._rerun, self._leaf = at, model_input[:, self._channels].to(wide).requires_grad_()
         result = at(self._leaf)
         self._output = _first(result)
         detached = self._output.detach()
@@ -238,34 +240,36 @@ class DenoiserTap:
         return (detached, *result[1:]) if isinstance(result, tuple) else type(result)(detached)
 
     def output_at(self, z_t: Tensor) -> Tensor:
-        """Network output with its graph to ``z_t (B, C, h, w)`` float32.
+        """Return the network output with its graph to ``z_t (B, C, h, w)`` float32.
 
-        At the latent of the latest call that call's output is reused: the first update costs no second call.
+        The latest call's output is reused at its own latent, so the first update needs no second forward
+        pass.
         """
-        assert self._at is not None and self._output is not None
-        return self._output if z_t is self._leaf else _first(self._at(z_t))
+        assert self._rerun is not None and self._output is not None
+        return self._output if z_t is self._leaf else _first(self._rerun(z_t))
 
 
 def _first(result: Any) -> Tensor:
-    """The tensor out of a tensor, a tuple or a ``BaseOutput``."""
+    """Return the tensor in a tensor, a tuple or a ``BaseOutput``."""
     return result if isinstance(result, Tensor) else result[0]
 
 
 class GuidedScheduler:
-    """A copy of the scheduler: ``set_timesteps`` starts a trajectory, ``step`` is guided.
+    """A copy of the scheduler whose ``set_timesteps`` starts a trajectory and whose ``step`` is guided.
 
-    So other pipelines with the same scheduler are not guided, and the user's scheduler keeps its state. If
-    the user replaced a method on the instance, that scheduler is used instead of a copy, because the method
-    usually refers to it; all its attributes are restored. ``step`` gets its timesteps on the CPU, where
-    diffusers keeps the tables that they index: a lookup on another device would wait for it. DDIM gets them
-    as Python's integers, with which it makes nine operations less of every step.
+    Other pipelines that share the scheduler are not guided, and the user's scheduler keeps its state. If the
+    user replaced a method on the instance, that instance is used instead of a copy, since the method usually
+    refers to it; all its attributes are restored.
 
-    ``run`` is a ``GuidedRun``, whose ``guide`` gives the inputs of the stock step and what to add to its
-    ``z_{t-1}``; ``respace`` runs a leading DDIM as trailing.
+    ``step`` receives its timesteps on the CPU, where diffusers keeps the tables they index: a lookup on
+    another device would synchronize. DDIM receives Python integers, which saves nine operations per step.
+
+    ``run`` is a ``GuidedRun``. Its ``guide`` returns the inputs of the stock step and the offset to add to
+    ``z_{t-1}``. ``trailing_spacing`` runs a DDIM scheduler with leading spacing as trailing.
     """
 
-    def __init__(self, pipe: Any, run: Any, respace: bool) -> None:
-        self._pipe, self._run, self._respace = pipe, run, respace
+    def __init__(self, pipe: Any, run: Any, trailing_spacing: bool) -> None:
+        self._pipe, self._run, self._trailing_spacing = pipe, run, trailing_spacing
         original = pipe.scheduler
         is_patched = any(name in vars(original) for name in ("set_timesteps", "step"))
         self._scheduler = original if is_patched else copy.copy(original)
@@ -273,10 +277,10 @@ class GuidedScheduler:
 
     @contextmanager
     def attached(self) -> Iterator[None]:
-        """Put the guided scheduler on the pipeline; entered again during a call it continues."""
+        """Install the guided scheduler on the pipeline; re-entering during a call continues it."""
         original, outside = self._pipe.scheduler, vars(self._scheduler)
         self._scheduler.__dict__ = self._inside
-        # Past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config.
+        # Bypass ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config.
         object.__setattr__(self._pipe, "scheduler", self._scheduler)
         try:
             yield
@@ -289,7 +293,7 @@ class GuidedScheduler:
         self._inside, self._run = {}, None
 
     def _wrapped(self) -> dict[str, Callable[..., Any]]:
-        """The two guided methods, as instance attributes that override those of the class."""
+        """Return the two guided methods as instance attributes that override the methods of the class."""
         scheduler = self._scheduler
         stock_set_timesteps, stock_step = scheduler.set_timesteps, scheduler.step
         is_ddim = getattr(stock_step, "__func__", None) is DDIMScheduler.step
@@ -298,11 +302,13 @@ class GuidedScheduler:
         def set_timesteps(*args: Any, **kwargs: Any) -> None:
             device = kwargs.get("device")
             stock_set_timesteps(*args, **kwargs | ({} if device is None else {"device": "cpu"}))
-            trailing = trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._respace else None
+            trailing = (
+                trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._trailing_spacing else None
+            )
             self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()
             self._numbers, self._done = self._timesteps.tolist(), 0
             self._run.begin(self._timesteps)
-            # The pipeline's loop iterates over these, on its own device.
+            # The pipeline's loop iterates over these timesteps on its own device.
             scheduler.timesteps = self._timesteps.to(device, non_blocking=True)
 
         @functools.wraps(stock_step)
@@ -310,13 +316,13 @@ class GuidedScheduler:
             given = timestep
             scheduler.timesteps, timestep = self._timesteps, self._timesteps[self._done]
             self._done += 1
-            output, z_t, move = self._run.guide(model_output, timestep, sample)
+            output, z_t, offset = self._run.guide(model_output, timestep, sample)
             number = self._numbers[self._done - 1] if is_ddim else timestep
             result = stock_step(output, number, z_t, *args, **kwargs)
             is_tuple = isinstance(result, tuple)
             previous = result[0] if is_tuple else result.prev_sample
-            if move is not None:
-                previous = (previous.float() + move).to(previous.dtype)
+            if offset is not None:
+                previous = (previous.float() + offset).to(previous.dtype)
             previous = self._run.after_step(torch.as_tensor(given, device=previous.device), previous)
             if is_tuple:
                 return (previous, *result[1:])

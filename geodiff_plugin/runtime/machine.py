@@ -1,4 +1,4 @@
-"""Devices, package versions, time and peak memory on this machine."""
+"""Reports devices, package versions, time and peak memory of this machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 import psutil  # comes with accelerate
 import torch
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 
 PACKAGES = ("geodiff-plugin", "torch", "diffusers", "transformers", "accelerate", "kornia", "numpy", "pillow")
 SAMPLING_INTERVAL_S = 0.05
@@ -20,7 +20,7 @@ SAMPLING_INTERVAL_S = 0.05
 
 @functools.cache
 def _version_of(package: str) -> str:
-    """Reading it takes milliseconds, and every report says it."""
+    """Return a package's version, cached: reading it takes milliseconds and every report includes it."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -28,13 +28,13 @@ def _version_of(package: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Version of Python and of every package that a result depends on."""
+    """Return the version of Python and of every package that a result depends on."""
     numbers = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
     return numbers | {name: _version_of(name) for name in PACKAGES}
 
 
 def pick_device(name: str) -> torch.device:
-    """The device of that name, if this machine has it; ``"auto"`` takes CUDA, then MPS, then the CPU."""
+    """Return the named device if this machine has it; ``"auto"`` prefers CUDA, then MPS, then the CPU."""
     here = {"cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available()), "cpu": 1}
     if name == "auto":
         return torch.device(next(kind for kind, count in here.items() if count))
@@ -46,13 +46,13 @@ def pick_device(name: str) -> torch.device:
         bad_value("--device", "auto, cpu, cuda, cuda:N or mps", repr(name))
     count = here[device.type]
     if (device.index or 0) >= count:
-        got = f"PyTorch finds {count or 'no'} {device.type} here."
+        got = f"PyTorch finds {count or 'no'} {device.type} devices."
         bad_value("--device", "a device of this machine", repr(name), got)
     return device
 
 
 def timed(call: Callable[[], object], device: torch.device) -> float:
-    """Seconds of a call; on CUDA until its last kernel has finished."""
+    """Measure the seconds of a call; on CUDA until its last kernel has finished."""
     started = time.perf_counter()
     call()
     if device.type == "cuda":
@@ -61,10 +61,10 @@ def timed(call: Callable[[], object], device: torch.device) -> float:
 
 
 class PeakMemory:
-    """The most memory in use inside a ``with`` block, in ``peak_bytes`` after it.
+    """Peak memory inside a ``with`` block, available as ``peak_bytes`` afterwards.
 
-    CUDA: ``max_memory_allocated``, weights included. CPU: resident set of the process, sampled every
-    50 ms, as increase over the start.
+    On CUDA it is ``max_memory_allocated``, weights included. On the CPU it is the growth of the process's
+    resident set, sampled every 50 ms.
     """
 
     def __init__(self, device: torch.device) -> None:

@@ -1,1 +1,6 @@
-"""Relative maps in metres: parametrisation (``space``), search and fit of the scale (S4.1, S7.3)."""
+"""The metric scale of a relative map: parametrisation, search, and fit to points (paper S4.1, S7.3).
+
+Belongs here: the spaces of priors and their affine maps, the search over near and far, and the fit to known
+points.
+Layer 4: imports ``matching`` and below; imported by ``evidence``, ``algorithm`` and ``result``.
+"""

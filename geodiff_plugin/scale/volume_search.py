@@ -1,7 +1,7 @@
-"""Search for the scale of a relative map, by lookup in a plane-sweep volume (S7.3).
+"""Searches the scale of a relative map by lookup in a plane-sweep volume (S7.3).
 
 The paper's search over one number, x = g_s x_rel, prefers depths at which every pixel leaves the right image.
-A joint search for (near, far) on pixels that stay in view does not (docs/reference/paper-map.md).
+A joint search for (near, far) on pixels that stay in view does not (docs/explanation/method.md).
 """
 
 from __future__ import annotations
@@ -16,40 +16,28 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._kernels import use_kernel
+from geodiff_plugin._internal.kernels import has_kernel
 from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching import CostVolume
-from geodiff_plugin.scale.space import KERNEL_FORMS, SPACES, DepthRange
+from geodiff_plugin.scale.constants import COARSE_GRID, COST_CLAMP, FINE_GRIDS, KEEP_MARGIN, KERNEL_FORMS
+from geodiff_plugin.scale.sampling import group_size, min_in_view
+from geodiff_plugin.scale.space import SPACES, DepthRange
 
-#: Cost beyond which a pixel is an outlier: occluded, a reflection, or wrong in the prior.
-COST_CLAMP = 0.35
-#: Pixels of the search, at most: a lookup costs time for each.
+#: Maximum number of pixels in the search; each costs one lookup.
 SAMPLES = 6000
-#: Number of groups of similar value that stand for them, at most.
-GROUPS = 512
-#: Values of near, and of far, in the coarse grid: 1128 pairs.
-COARSE_GRID = 48
-#: Values of near, and of far, in each of the finer grids around the best pair.
-FINE_GRIDS = (13, 13)
-#: The current state stays if its cost is this close to the best: a new one restarts scale and shift.
-KEEP_MARGIN = 2e-3
-#: Least share of the pixels that must stay in view of a rectified pair.
-IN_VIEW_RECTIFIED = 0.6
-#: The same of a posed pair: at the true depth some share only .3 of the pixels.
-IN_VIEW_POSED = 0.25
 
 
 class Groups(NamedTuple):
-    """Sampled pixels of a relative map in ``K`` groups of similar value, tested by ``K`` lookups."""
+    """Sampled pixels of a relative map in ``K`` groups of similar value, evaluated by ``K`` lookups."""
 
-    mean: Tensor  # (K,) their value
+    mean: Tensor  # (K,) mean value
     size: Tensor  # (K,) number of pixels
-    seen: Tensor  # (D, K) how many of them a right view sees, on each plane
+    seen: Tensor  # (D, K) number of pixels that a right view sees, on each plane
     cost: Tensor  # (D, K) sum of their clamped costs
 
 
 class _Best(NamedTuple):
-    """The best candidate: both ends in metres, and its mean cost, ``(1,)`` each."""
+    """The best candidate: both ends in metres and its mean cost, ``(1,)`` each."""
 
     near_m: Tensor
     far_m: Tensor
@@ -57,7 +45,7 @@ class _Best(NamedTuple):
 
 
 def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> Groups:
-    """Values ``x (P,)``, with ``cost`` and ``in_view (D, P)``, sorted and put into groups of one size."""
+    """Sort values ``x (P,)``, with ``cost`` and ``in_view (D, P)``, into groups of equal size."""
     order, each = x.argsort(), group_size(len(x))
 
     def summed(values: Tensor) -> Tensor:
@@ -67,21 +55,16 @@ def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> Groups:
     return Groups(summed(x) / size, size, summed(seen), summed(cost.clamp_max(COST_CLAMP) * seen))
 
 
-def group_size(pixels: int) -> int:
-    """Number of pixels in a group."""
-    return -(-pixels // GROUPS)
-
-
 def look_up(groups: Groups, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean clamped cost and share in view ``(M,)`` of candidate depths ``(M, K)``, linear between planes.
+    """Look up mean clamped cost and fraction in view ``(M,)`` of candidate depths ``(M, K)``.
 
-    ``inverse_depth (D,)`` are the planes, evenly spaced.
+    ``inverse_depth (D,)`` are the planes, evenly spaced; costs are linear between planes.
     """
     planes = inverse_depth.shape[0]
     step = (inverse_depth[-1] - inverse_depth[0]) / (planes - 1)
     position = (depth_m.reciprocal() - inverse_depth[0]) / step
     inside = (position >= 0) & (position <= planes - 1)
-    # NaN cannot be an index; ``algorithm.gradients.FiniteWatch`` reports its origin after the loop.
+    # NaN is not a valid index; ``algorithm.optimizers.FiniteWatch`` reports its origin after the loop.
     position = position.clamp(0, planes - 1).nan_to_num(0.0)
     below = position.floor().clamp_max(planes - 2).long()
     weight = position - below
@@ -89,7 +72,7 @@ def look_up(groups: Groups, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Ten
     def between(table: Tensor) -> Tensor:
         return torch.lerp(table.gather(0, below), table.gather(0, below + 1), weight)
 
-    # Beyond the nearest plane the cost is unknown: it counts as an outlier, not as out of view.
+    # Beyond the nearest plane the cost is unknown; it counts as an outlier, not as out of view.
     summed = torch.where(inside, between(groups.cost), COST_CLAMP * groups.size).sum(1)
     count = torch.where(inside, between(groups.seen), groups.size).sum(1)
     return summed / count.clamp_min(1.0), count / groups.size.sum()
@@ -105,20 +88,20 @@ def search_scale(
     current: DepthRange | None = None,
     valid: Tensor | None = None,
 ) -> DepthRange:
-    """Depths of the two ends of relative maps that the two views agree on best.
+    """Find the depths of both ends of relative maps at which the two views agree best.
 
     With ``z_p`` the depth that a pair (near, far) gives pixel ``p``, ``c_p`` its cost in the volume and ``S``
-    the pixels in view, the pair minimises ``mean_{p in S} min(c_p(z_p), COST_CLAMP)``, among pairs that keep
-    enough pixels in view: 1128 of them, log-spaced, then two finer grids around the best. It is on the edge
-    where it touches the far end of the range, or the near end of a given range.
+    the pixels in view, the pair minimizes ``mean_{p in S} min(c_p(z_p), COST_CLAMP)`` among pairs that keep
+    enough pixels in view: 1128 log-spaced pairs, then two finer grids around the best. It is on the edge if
+    it touches the far end of the range, or the near end of a given range.
 
     Args:
         volume: plane-sweep costs of the image.
         x: ``(B, 1, h, w)`` relative maps of that image, about [0, 1], >= 0.
-        space: what ``x`` is affine in, key of ``SPACES``.
-        depth_range: metres, bounds of the search; by default ``volume.reach_m``.
-        current: the range in use, kept unless a better basin shows up.
-        valid: ``(1, 1, H, W)`` bool, the pixels of the maps that count; ``None`` for all.
+        space: space in which ``x`` is affine, key of ``SPACES``.
+        depth_range: bounds of the search, metres; by default ``volume.reach_m``.
+        current: the current range, kept unless a better basin is found.
+        valid: ``(1, 1, H, W)`` bool, the pixels of the maps to use; ``None`` for all.
 
     Source: S7.3. Deviation: two numbers instead of one, clamped census cost instead of L_geo.
     """
@@ -128,11 +111,15 @@ def search_scale(
     in_use = None if current is None else current[:2]
     near_m, far_m = _best_range(volume, values, at, space, (low, high), in_use)
     on_edge = far_m >= high * 0.98
-    if depth_range is not None:  # the volume's near end lies nearer than any match, and cuts nothing off
+    if depth_range is not None:  # the volume's near end is nearer than any match
         on_edge |= near_m <= low * 1.02
     return DepthRange(near_m, far_m, on_edge)
 
 
+@has_kernel(
+    "scale.kernels.search.best_range",
+    when=lambda volume, x, at, space, bounds, current: space in KERNEL_FORMS,
+)
 def _best_range(
     volume: CostVolume,
     x: Tensor,
@@ -141,14 +128,10 @@ def _best_range(
     bounds: tuple[float, float],
     current: tuple[Tensor, Tensor] | None,
 ) -> tuple[Tensor, Tensor]:
-    """Metres ``(B,)`` of the best ends within bounds for values ``x (B, P)`` at pixels ``at (P,)``.
+    """Search the best ends, metres ``(B,)``, within bounds for values ``x (B, P)`` at pixels ``at (P,)``.
 
-    The ``current`` ends stay unless others are better by ``KEEP_MARGIN``.
+    The ``current`` ends are kept unless others are better by ``KEEP_MARGIN``.
     """
-    if use_kernel(x) and space in KERNEL_FORMS:
-        from geodiff_plugin.scale import search_kernels
-
-        return search_kernels.best_range(volume, x, at, space, bounds, current)
     (cost, in_view), ranges = volume.at_pixels(at), []
     for b, row in enumerate(x):
         best_of = partial(_best_of, group_pixels(row, cost, in_view), volume, space)
@@ -164,7 +147,7 @@ def _best_range(
 
 
 def _sampled(size: tuple[int, int], valid: Tensor | None, like: Tensor) -> Tensor:
-    """Flat indices of about ``SAMPLES`` pixels of a grid ``(H, W)``, of those that count if there are any."""
+    """Return flat indices of about ``SAMPLES`` pixels of a grid ``(H, W)``, valid ones if there are any."""
     stride = max(1, round((size[0] * size[1] / SAMPLES) ** 0.5))
     rows, columns = (np.arange(stride // 2, side, stride) for side in size)
     at = to_device_of(like, (rows[:, None] * size[1] + columns[None]).ravel())
@@ -175,34 +158,29 @@ def _sampled(size: tuple[int, int], valid: Tensor | None, like: Tensor) -> Tenso
 
 
 def _best_of(groups: Groups, volume: CostVolume, space: str, near_m: Tensor, far_m: Tensor) -> _Best:
-    """The best of candidate ends ``(M,)`` for one map."""
+    """Return the best of candidate ends ``(M,)`` for one map."""
     depth_m = SPACES[space].depth_at(groups.mean[None], near_m[:, None], far_m[:, None])
-    mean, share = look_up(groups, volume.inverse_depth, depth_m)
-    # Of those that keep too few in view one wins only if no pair keeps enough.
-    mean = mean + (share < least_in_view(volume)) * 1.0
+    mean, fraction = look_up(groups, volume.inverse_depth, depth_m)
+    # A pair that keeps too few pixels in view wins only if no pair keeps enough.
+    mean = mean + (fraction < min_in_view(volume)) * 1.0
     k = mean.argmin(keepdim=True)  # a 0-d index would be read back from the device
     return _Best(near_m[k], far_m[k], mean[k])
-
-
-def least_in_view(volume: CostVolume) -> float:
-    """Least share of the pixels that must stay in view."""
-    return IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
 
 
 def _coarse_to_fine(
     best_of: Callable[[Tensor, Tensor], _Best], low: float, high: float, like: Tensor
 ) -> _Best:
-    """The best ends in [low, high]: of a coarse grid, then of two finer ones."""
+    """Search the best ends in [low, high] on a coarse grid, then on two finer ones."""
     grid = torch.linspace(0, 1, COARSE_GRID, dtype=like.dtype, device=like.device)
     log_low, log_span = math.log(low), math.log(high / low)
     i, j = torch.triu_indices(COARSE_GRID, COARSE_GRID, 1, device=like.device)
     best = best_of(*(torch.exp(log_low + log_span * grid[k]) for k in (i, j)))
-    reach = log_span / (COARSE_GRID - 1)
+    radius = log_span / (COARSE_GRID - 1)
     for values in FINE_GRIDS:
         offsets = torch.linspace(-1, 1, values, dtype=like.dtype, device=like.device)
-        log_near = best.near_m.log() + reach * offsets.repeat_interleave(values)
-        log_far = best.far_m.log() + reach * offsets.repeat(values)
+        log_near = best.near_m.log() + radius * offsets.repeat_interleave(values)
+        log_far = best.far_m.log() + radius * offsets.repeat(values)
         near, far = (each.exp().clamp(low, high) for each in (log_near, log_far))
         best = best_of(torch.minimum(near, far), torch.maximum(near, far))
-        reach = reach / (values - 1) * 2
+        radius = radius / (values - 1) * 2
     return best

@@ -1,4 +1,4 @@
-"""Seconds of a guided call beside the plain call and OpenCV's eight-path semi-global matching.
+"""Seconds of a guided call next to the plain call and OpenCV's eight-path semi-global matching.
 
 Data flow: rendered or real pairs -> a table (``python -m tests.benchmarks.calls``).
 """
@@ -9,18 +9,18 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
 from geodiff_plugin.bundled import load_bundled_prior
+from geodiff_plugin.cameras import PosedViews
 from geodiff_plugin.config import DEFAULT, config_from_text
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.matching.build import build_cost_volume
 from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
-from geodiff_plugin.types import PosedViews
 from tests.benchmarks.matching import (
-    Pair,
     data_pairs,
     disparities_of,
     least_seconds,
@@ -31,24 +31,25 @@ from tests.benchmarks.matching import (
 __all__ = ["calls_of", "main"]
 
 
-def calls_of(pair: Pair, pipe: Any, knobs: str = "") -> dict[str, Callable[[], object]]:
+def calls_of(posed: PosedViews, pipe: Any, parameters: str = "") -> dict[str, Callable[[], object]]:
     """The calls that are compared, by name; each does all of its work every time that it is called.
 
     Args:
-        pair: left image, right view, ``K_left``.
+        posed: a pair.
         pipe: a pipeline with guidance enabled.
-        knobs: changes of the default preset, ``knob=value``, several joined by ``+``.
+        parameters: changed parameters of the default preset, ``parameter=value``, several joined by ``+``.
     """
-    left, (right, K_right, T), K = pair
-    config = config_from_text(knobs.split("+"), DEFAULT, "knobs") if knobs else DEFAULT
+    left, right = posed.left.image_01, posed.rights[0]
+    config = config_from_text(parameters.split("+"), DEFAULT, "parameters") if parameters else DEFAULT
     arguments = {"generator": torch.Generator(left.device).manual_seed(0)}
 
     def guided() -> object:
-        guidance = GeometryGuidance(right, (K, K_right), torch.linalg.inv(T), config=config)
+        Ks, E = (posed.left.camera.K, right.camera.K), np.linalg.inv(right.T_right_from_left)
+        guidance = GeometryGuidance(right.image_01, Ks, E, config=config)
         return pipe(left[None], guidance=guidance, **arguments)
 
     calls = {"plain": lambda: pipe(left[None], **arguments), "guided": guided}
-    sgbm = sgbm_call(pair, disparities_of(build_cost_volume(PosedViews(left, (pair[1],), K)), left.shape[-1]))
+    sgbm = sgbm_call(posed, disparities_of(build_cost_volume(posed), posed.size[1]))
     return calls | {"SGBM": sgbm}
 
 
@@ -56,16 +57,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table; ``--help`` lists the options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--size", type=int, nargs=2, default=(375, 1242), metavar=("H", "W"))
-    parser.add_argument("--data", metavar="DIR", help="pairs in it, or synthetic:N; by default a made-up one")
+    parser.add_argument(
+        "--data", metavar="DIR", help="folder of pairs, or synthetic:N (default: one synthetic pair)"
+    )
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1], help="one row for each")
-    parser.add_argument("--repeats", type=int, default=3, help="the least of so many is shown")
-    parser.add_argument("--knobs", default="", metavar="KNOB=VALUE+...", help="changes of the default preset")
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[1], help="numbers of threads, one row each"
+    )
+    parser.add_argument("--repeats", type=int, default=3, help="number of runs; the fastest is shown")
+    parser.add_argument(
+        "--parameters", default="", metavar="NAME=VALUE+...", help="changed parameters of the default preset"
+    )
     options = parser.parse_args(arguments)
     pipe = enable_geometry_guidance(load_bundled_prior().to(options.device))
     pipe.set_progress_bar_config(disable=True)
     if options.data is None:
-        pairs = iter([("made up", textured_pair(tuple(options.size), options.device)[:3])])
+        pairs = iter([("made up", textured_pair(tuple(options.size), options.device)[0])])
     else:
         pairs = data_pairs(options.data, options.device)
     title = f"CPU seconds (seconds of a clock) on {options.device}"
@@ -76,11 +83,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             torch.set_num_threads(threads)
             seconds = {
                 key: least_seconds(work, options.device, options.repeats)
-                for key, work in calls_of(pair, pipe, options.knobs).items()
+                for key, work in calls_of(pair, pipe, options.parameters).items()
             }
             shown = [f"{seconds[k][0]:.2f} ({seconds[k][1]:.2f})" for k in ("plain", "guided", "SGBM")]
             guided, sgbm = (seconds[k][0] for k in ("guided", "SGBM"))
-            size = f"{pair[0].shape[-1]}x{pair[0].shape[-2]}"
+            size = "{1}x{0}".format(*pair.size)
             table.add_row(name, size, f"{threads}", *shown, f"{guided / sgbm:.1f}")
             total[threads] = total[threads][0] + guided, total[threads][1] + sgbm
     for threads, (guided, sgbm) in total.items():

@@ -1,4 +1,4 @@
-"""Captures of rendered scenes with the poses of a drifting tracker, where truth is exact.
+"""Captures of rendered scenes with the poses of a drifting tracker, where ground truth is exact.
 
 python -m tests.benchmarks.capture --scenes 4 --frames 24 --out captures --rows given,capture
 """
@@ -54,9 +54,11 @@ def write_capture(folder: Path, seed: int, frames: int, size: tuple[int, int]) -
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--scenes", type=int, default=4)
-    parser.add_argument("--frames", type=int, default=24, help="of each scene")
-    parser.add_argument("--count", type=int, default=4, help="frames of each that are measured")
-    parser.add_argument("--size", type=int, nargs=2, default=(288, 384), metavar=("H", "W"), help="pixels")
+    parser.add_argument("--frames", type=int, default=24, help="number of frames per scene")
+    parser.add_argument("--count", type=int, default=4, help="number of measured frames per scene")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(288, 384), metavar=("H", "W"), help="size in pixels"
+    )
     parser.add_argument("--neighbours", default="5")
     parser.add_argument("--rows", default="given,pairs,capture")
     parser.add_argument("--out", type=Path, default=Path("geodiff-captures"))

@@ -1,8 +1,8 @@
-"""Which corrections are worth their cost: error of the default with fewer, coarser or tiny-decoder ones.
+"""Which match fits are worth their cost: error of the default with fewer or coarser ones, or a tiny decoder.
 
-Data flow: rendered pairs, knobs -> AbsRel with the bundled prior and with emulated ones -> table.
+Data flow: rendered pairs, parameters -> AbsRel with the bundled prior and with emulated ones -> table.
 
-    python -m tests.benchmarks.corrections --pairs 3 corrections=4 corrections=2
+    python -m tests.benchmarks.corrections --pairs 3 match_fits=4 match_fits=2
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from tests.lab.strength import EmulatedPrior
 
 __all__ = ["main"]
 
-#: The prior that ships, beside the keys of ``STRENGTHS``.
+#: The prior that ships, next to the keys of ``STRENGTHS``.
 BUNDLED = "bundled"
 #: Longer side for emulated priors, pixels; the bundled one has its own.
 RESOLUTION = 256
 
 
 def _error_and_seconds(
-    sample: StereoSample, knobs: str, settings: Settings, cache: PriorCache
+    sample: StereoSample, parameters: str, settings: Settings, cache: PriorCache
 ) -> tuple[float, float]:
-    method = find_method(f"guided:{knobs}" if knobs else "guided")
+    method = find_method(f"guided:{parameters}" if parameters else "guided")
     started = time.process_time()
     depth_m = method.run(sample, settings, cache).depth_m
     seconds = time.process_time() - started
@@ -46,8 +46,12 @@ def _error_and_seconds(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables; ``--help`` lists the options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("knobs", nargs="+", help="KNOB=VALUE[+KNOB=VALUE] each, the first is compared with")
-    parser.add_argument("--data", default="synthetic:3", help="synthetic:N, or a folder with dense truth")
+    parser.add_argument(
+        "parameters", nargs="+", help="NAME=VALUE[+NAME=VALUE] each; the first is the reference"
+    )
+    parser.add_argument(
+        "--data", default="synthetic:3", help="synthetic:N, or a folder with dense ground truth"
+    )
     parser.add_argument(
         "--priors", nargs="*", default=[BUNDLED, "exact", "10%"], help=f"of {[BUNDLED, *STRENGTHS]}"
     )
@@ -72,19 +76,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             own = settings if prior == BUNDLED else replace(settings, resolution=RESOLUTION)
             if prior != BUNDLED:
                 emulated.answer(sample, STRENGTHS[prior], RESOLUTION)
-            for knobs in typed.knobs:
-                one = _error_and_seconds(sample, knobs, own, cache if prior == BUNDLED else twin)
-                found.setdefault((prior, knobs), []).append(one)
-                print(f"{ref.label:<28}{prior:<10}{knobs:<36}{one[0]:.4f}{one[1]:>8.2f}", flush=True)
+            for parameters in typed.parameters:
+                one = _error_and_seconds(sample, parameters, own, cache if prior == BUNDLED else twin)
+                found.setdefault((prior, parameters), []).append(one)
+                print(f"{ref.label:<28}{prior:<10}{parameters:<36}{one[0]:.4f}{one[1]:>8.2f}", flush=True)
     print(f"\n{'prior':<10}{'knobs':<36}{'AbsRel':>8}{'change':>9}{'worst':>9}{'CPU s':>8}")
     for prior in typed.priors:
-        base = [error for error, _ in found[prior, typed.knobs[0]]]
-        for knobs in typed.knobs:
-            errors, seconds = zip(*found[prior, knobs], strict=True)
+        base = [error for error, _ in found[prior, typed.parameters[0]]]
+        for parameters in typed.parameters:
+            errors, seconds = zip(*found[prior, parameters], strict=True)
             change = [e - b for e, b in zip(errors, base, strict=True)]
             sums = (sum(errors), sum(change), max(change) * len(base), sum(seconds))
             mean, moved, worst, taken = (value / len(base) for value in sums)
-            print(f"{prior:<10}{knobs:<36}{mean:>8.4f}{moved:>+9.4f}{worst:>+9.4f}{taken:>8.2f}")
+            print(f"{prior:<10}{parameters:<36}{mean:>8.4f}{moved:>+9.4f}{worst:>+9.4f}{taken:>8.2f}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""The engines of ``geodiff depth`` on many pairs: one process, and Ray with some workers, in one run.
+"""Compare the engines of ``geodiff depth`` on many pairs: one process, and Ray with some workers.
 
-Data flow: rendered pairs in two folders -> the command, once an engine, watched from outside -> a table
+Data flow: rendered pairs in two folders -> the command, once per engine, observed from outside -> a table
     (``python -m tests.benchmarks.many --engine ray``).
 """
 
@@ -24,7 +24,7 @@ from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef
 
-#: Seconds between two looks at a command: short beside a pair, long beside a look.
+#: Seconds between two looks at a command: short next to a pair, long next to a look.
 INTERVAL_S = 0.25
 #: One thread for each process that computes, and none nicer than another: Ray's are nice by 15 without it.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
@@ -143,11 +143,13 @@ def compare_engines(options: DepthOptions, pairs: int, workers: int, folder: Pat
     words, on_ray = words_of(options), ["--engine", "ray", "--workers", str(workers)]
     ways = {
         "one process": ([], folders_done),
-        f"Ray, {workers} workers, folders": ([*on_ray, "--as", "folders"], folders_done),
-        f"Ray, {workers} workers, Parquet": ([*on_ray, "--as", "parquet"], rows_done),
+        f"Ray, {workers} workers, folders": ([*on_ray, "--format", "folders"], folders_done),
+        f"Ray, {workers} workers, Parquet": ([*on_ray, "--format", "parquet"], rows_done),
     }
-    headings = ("engine", "start, s", "whole, s", "pairs a second", "CPU seconds a pair", "driver MB")
-    table = new_table(headings, f"{pairs} pairs; rates without the start, which ends with the first results")
+    headings = ("engine", "startup, s", "total, s", "pairs/s", "CPU s/pair", "driver, MB")
+    table = new_table(
+        headings, f"{pairs} pairs; rates exclude the startup, which ends with the first results"
+    )
     for number, (way, (more, done)) in enumerate(ways.items()):
         seen = watch([*words, *more], folder / f"out-{number}", done)
         assert seen.first is not None and seen.last is not None
@@ -155,4 +157,4 @@ def compare_engines(options: DepthOptions, pairs: int, workers: int, folder: Pat
         whole = f"{seen.first.seconds:.0f}", f"{seen.last.seconds:.0f}"
         table.add_row(way, *whole, f"{1 / clock:.2f}", f"{cpu:.2f}", f"{seen.driver_bytes / 1e6:.0f}")
     show(table)
-    print(f"A pair that is listed takes {bytes_of_a_listed_pair()} bytes of the driver.")
+    print(f"Each listed pair takes {bytes_of_a_listed_pair()} bytes in the driver.")

@@ -1,10 +1,10 @@
-"""What a guided call launches on CUDA, so that it can be compiled before: geodiff_plugin/first_launches.json.
+"""List the kernels that a guided call launches on CUDA: geodiff_plugin/_internal/first_launches.json.
 
     python -m tests.benchmarks.first_launches --write
 
 Data flow: the demo pair, the bundled prior -> one ``Launch`` for each kernel that Triton compiles.
-Without ``--write`` it tells whether the file is up to date. ``--compile THREADS`` compiles them for an H100,
-which need not be there, and prints the seconds.
+Without ``--write`` it reports whether the file is up to date. ``--compile THREADS`` compiles for an H100,
+without a GPU, and prints the seconds.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from diffusers.utils import logging as diffusers_logging
 from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 
-from geodiff_plugin import _compilation
-from geodiff_plugin._compilation import FIRST_LAUNCHES, Launch, compile_kernels
+from geodiff_plugin._internal import compilation as _compilation
+from geodiff_plugin._internal.compilation import FIRST_LAUNCHES, Launch, compile_kernels
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from tests.benchmarks.launches import Counting, as_on_cuda, guided_demo_call
@@ -130,7 +130,7 @@ def main() -> None:
     """Write the file, check it, or compile."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--write", action="store_true", help="write the file")
-    parser.add_argument("--compile", type=int, metavar="THREADS", help="compile by so many threads")
+    parser.add_argument("--compile", type=int, metavar="THREADS", help="number of threads that compile")
     diffusers_logging.set_verbosity_error()
     typed = parser.parse_args()
     if typed.compile:

@@ -1,4 +1,4 @@
-"""What guidance costs at the size of Marigold v1-1, with random weights, beside Marigold-DC's published loop.
+"""Cost of guidance at Marigold v1-1's size, with random weights, compared with Marigold-DC's published loop.
 
 Data flow: a seed -> plain, guided, guided with a tiny decoder, Marigold-DC
     -> seconds, memory, operations, ratios.
@@ -70,7 +70,7 @@ def _print_counted(size: Size) -> None:
         plain = plain or total
         counts = ", ".join(f"{n} {kind}" for kind, n in sorted(calls.items()))
         print(f"{way:<24}{total / 1e12:>10.2f}{total / plain:>9.2f}  {counts}", flush=True)
-    print("Evidence, the correction's solves and the refinement are no products of matrices: not counted.")
+    print("Not counted, because they are not matrix products: evidence, match fitting and the final fit.")
 
 
 def _print_measured(size: Size, device: torch.device) -> None:
@@ -99,13 +99,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table; ``--help`` lists the options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:N or mps")
-    parser.add_argument("--count", action="store_true", help="operations, by tensors without data")
-    parser.add_argument("--width", type=float, default=1.0, help="share of the published channels")
-    parser.add_argument("--resolution", type=int, default=768, help="longer side, pixels")
+    parser.add_argument("--count", action="store_true", help="count operations with fake tensors instead")
+    parser.add_argument(
+        "--width", type=float, default=1.0, help="fraction of the published number of channels"
+    )
+    parser.add_argument("--resolution", type=int, default=768, help="longer side in pixels")
     parser.add_argument("--steps", type=int, default=4)
-    parser.add_argument("--dc-steps", type=int, default=50, help="of Marigold-DC")
+    parser.add_argument("--dc-steps", type=int, default=50, help="number of steps of Marigold-DC")
     parser.add_argument("--dtype", default="float32", choices=("float32", "float16", "bfloat16"))
-    parser.add_argument("--repeats", type=int, default=2, help="calls after the first")
+    parser.add_argument("--repeats", type=int, default=2, help="number of calls after the first")
     typed = parser.parse_args(arguments)
     diffusers_logging.set_verbosity_error()
     size = Size(typed.width, typed.resolution, typed.steps, typed.dc_steps, typed.dtype, typed.repeats)

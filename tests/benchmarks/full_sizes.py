@@ -1,9 +1,9 @@
-"""Architectures of all priors at full size with random weights, to measure what they cost.
+"""Architectures of all priors at full size with random weights, to measure their cost.
 
 Data flow: key of ``PRIORS`` -> pipeline of that architecture.
 Paper: S5.1 (the prior of the experiments is the first).
 
-Sizes as the published weights have them; for DepthFM, PPD and GeoWizard as the authors' code sets them.
+Sizes come from the published weights, or for DepthFM, PPD and GeoWizard from the authors' code.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 
 __all__ = ["FULL_SIZES", "SCHEDULER", "UNET", "VAE"]
 
-#: The U-Net of Stable Diffusion 2 with 8 input channels: image latent beside depth latent.
+#: The U-Net of Stable Diffusion 2 with 8 input channels: image latent next to depth latent.
 UNET: dict[str, Any] = {
     "sample_size": 96,
     "in_channels": 8,

@@ -1,11 +1,11 @@
-"""What a second view costs on a GPU, in one run of some four minutes: ``python -m tests.benchmarks.gpu``.
+"""Cost of guidance on a GPU, in one run of about four minutes: ``python -m tests.benchmarks.gpu``.
 
-Data flow: the demo pair, Marigold v1-1's size with random weights, the bundled prior -> a table a part,
+Data flow: the demo pair, Marigold v1-1's size with random weights, the bundled prior -> a table per part,
     and all of them as JSON (``--json FILE``).
 Paper: S5.4 (cost).
 
-It needs a checkout, its dependencies and no network. A part that fails prints its error and the others go
-on. ``--smoke`` is the same at a tiny size on any machine; its numbers say nothing.
+It needs a checkout, its dependencies and no network. If a part fails, its error is printed and the others
+continue. ``--smoke`` runs at a tiny size on any machine; its numbers are meaningless.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import torch
 from diffusers.utils import logging as diffusers_logging
 from PIL import Image
 
-from geodiff_plugin._kernels import has_triton, without_kernels
+from geodiff_plugin._internal.kernels import has_triton, without_kernels
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, DemoPair, read_demo_pair
 from geodiff_plugin.evidence.guidance import GeometryGuidance
@@ -52,11 +52,11 @@ __all__ = ["PARTS", "Bench", "Scope", "main"]
 BUDGET_S, GRACE_S = 210, 60
 #: A function, or a method as ``Class.method``, and what it is a part of: indented below it.
 STAGES = (
-    "GeometryGuidance.evidence_of",
+    "GeometryGuidance.plan_evidence",
     "  clean",
     "  fit_of_small",
     "  measure_fit",
-    "  refine_views",
+    "  check_poses",
     "  build_cost_volume",
     "    sweep_planes",
     "  match_volume",
@@ -70,7 +70,7 @@ STAGES = (
     "fit_depth",
     "GuidedRun.output",
     "  sharpen_edges",
-    "  vote_depth",
+    "  filter_depth",
     "  depth_confidence",
 )
 #: One cell of a row of a table.
@@ -85,7 +85,7 @@ class Scope:
     Attributes:
         size: of the full-size prior; ``repeats`` is the number of timed rounds.
         published_steps: of Marigold-DC, whose loop is also run once as it was published.
-        sides: longer sides of the large pictures, pixels.
+        sides: longer sides of the large images, pixels.
         pairs: in the folder.
         presets: compared between CPU and device.
         device: where.
@@ -106,10 +106,10 @@ def _generator() -> torch.Generator:
     return torch.Generator("cpu").manual_seed(0)
 
 
-def _guided(pipe: Any, pair: DemoPair, knobs: dict[str, Any] | None = None, **options: Any) -> Any:
-    """A guided call on a pair, with its guidance made anew, so that no evidence is there already."""
+def _guided(pipe: Any, pair: DemoPair, parameters: dict[str, Any] | None = None, **options: Any) -> Any:
+    """A guided call on a pair, with its guidance made again, so that no evidence is there already."""
     cameras = (pair.rig.K_left, pair.rig.K_right), pair.rig.E
-    guidance = GeometryGuidance(pair.right, *cameras, **knobs or {})
+    guidance = GeometryGuidance(pair.right, *cameras, **parameters or {})
     return pipe(pair.left, guidance=guidance, generator=_generator(), **options)
 
 
@@ -186,7 +186,7 @@ class Bench:
         return pipe
 
     def rows(self, calls: dict[str, Callable[[], Any]]) -> Iterator[Row]:
-        """The cost of every call, beside that of the one named "plain"."""
+        """The cost of every call, next to the cost of the call named "plain"."""
         found = costs(calls, self.device, self.scope.size.repeats, self.until)
         plain = found["plain"]
         for name, cost in found.items():
@@ -194,11 +194,11 @@ class Bench:
                 yield _row_of(name, cost, plain if isinstance(plain, Cost) else None)
             else:
                 self.failed += 1
-                yield {"way": name, "failed": f"{type(cost).__name__}: {cost}"}
+                yield {"call": name, "failed": f"{type(cost).__name__}: {cost}"}
 
 
 def _row_of(name: str, cost: Cost, plain: Cost | None) -> Row:
-    row: Row = {"way": name, "ms": round(cost.milliseconds, 2)}
+    row: Row = {"call": name, "ms": round(cost.milliseconds, 2)}
     row["x plain"] = None if plain is None else round(cost.milliseconds / plain.milliseconds, 2)
     row["fastest, ms"] = round(cost.fastest_ms, 2)
     row["fastest x plain"] = None if plain is None else round(cost.fastest_ms / plain.fastest_ms, 2)
@@ -238,7 +238,7 @@ def full_size(bench: Bench) -> Iterator[Row]:
     guided = calls["guided"]()
     for other in ("guided, without kernels", "guided, graphs"):
         mean, most = _difference(calls[other](), guided)
-        yield {"differences": f"{other} from guided", "mean": mean, "largest": most}
+        yield {"relative difference": f"{other} from guided", "mean": mean, "maximum": most}
 
 
 def stages(bench: Bench) -> Iterator[Row]:
@@ -261,13 +261,13 @@ def stages(bench: Bench) -> Iterator[Row]:
 def waits(bench: Bench) -> Iterator[Row]:
     """Where the host waits for the device in one guided call at full size, most often first."""
     if bench.device.type != "cuda":
-        yield {"place": "none: only CUDA is waited for", "waits": None}
+        yield {"place": "none: the host waits only for CUDA", "waits": None}
         return
     call = functools.partial(_guided, bench.pipe, bench.pair, **bench.call)
     plain = functools.partial(_plain, bench.pipe, bench.pair, **bench.call)
-    yield {"place": "of a plain call, in all", "waits": waits_by_place(plain).total()}
+    yield {"place": "plain call, total", "waits": waits_by_place(plain).total()}
     found = waits_by_place(call)
-    yield {"place": "of a guided call, in all", "waits": found.total()}
+    yield {"place": "guided call, total", "waits": found.total()}
     yield from ({"place": place, "waits": count} for place, count in found.most_common(30))
 
 
@@ -284,12 +284,12 @@ def equality(bench: Bench) -> Iterator[Row]:
     """Relative differences of the bundled prior's depth in float32 from that of the CPU without kernels."""
     here, there = bench.bundled("cpu"), bench.bundled(bench.device)
     for preset in bench.scope.presets:
-        knobs = {"preset": preset}
-        reference = _referred(functools.partial(_guided, here, bench.pair, knobs))()
-        call = functools.partial(_guided, there, bench.pair, knobs)
+        parameters = {"preset": preset}
+        reference = _referred(functools.partial(_guided, here, bench.pair, parameters))()
+        call = functools.partial(_guided, there, bench.pair, parameters)
         for name, made in (("as it is", call), ("without kernels", _referred(call))):
             mean, most = _difference(made(), reference)
-            yield {"preset": preset, f"on {bench.device.type}": name, "mean": mean, "largest": most}
+            yield {"preset": preset, f"on {bench.device.type}": name, "mean": mean, "maximum": most}
 
 
 def one_step(bench: Bench) -> Iterator[Row]:
@@ -318,7 +318,7 @@ def one_step(bench: Bench) -> Iterator[Row]:
 
 
 def large(bench: Bench) -> Iterator[Row]:
-    """Large pictures at the processing resolution of the others."""
+    """Large images at the processing resolution of the others."""
     for side in bench.scope.sides:
         left, right, (K_left, K_right) = resized_pair(bench.pair, side)
         rig = replace(bench.pair.rig, K_left=K_left, K_right=K_right)
@@ -340,9 +340,9 @@ def folder(bench: Bench) -> Iterator[Row]:
     where, size = bench.folder / "pairs", bench.scope.size
     for side in ("left", "right"):
         (where / side).mkdir(parents=True)
-        picture = (DEMO_PAIR_FOLDER / f"{side}.png").read_bytes()
+        rgb = (DEMO_PAIR_FOLDER / f"{side}.png").read_bytes()
         for i in range(bench.scope.pairs):
-            (where / side / f"{i:03}.png").write_bytes(picture)
+            (where / side / f"{i:03}.png").write_bytes(rgb)
 
     def plain() -> None:
         for path in sorted((where / "left").iterdir()):
@@ -364,14 +364,14 @@ def folder(bench: Bench) -> Iterator[Row]:
     enable_geometry_guidance(bench.pipe, graphs=graphs_for_many(options, bench.device))
     with closing(ManyPairs(options, bench.pipe)) as many:
         guided = functools.partial(many.seconds, None, True)
-        calls = {"plain, files read and written": plain, "guided, the command": guided}
+        calls = {"plain, with file I/O": plain, "guided, geodiff depth": guided}
         rounds = 3  # graphs are recorded at the second call of a size
         taken = {name: min(timed(call, bench.device) for _ in range(rounds)) for name, call in calls.items()}
-    enable_geometry_guidance(bench.pipe, graphs=False)
+    enable_geometry_guidance(bench.pipe, cuda_graphs=False)
     first = next(iter(taken.values()))
     for name, seconds in taken.items():
         rate = bench.scope.pairs / seconds
-        yield {"way": name, "pairs/s": round(rate, 2), "of plain's": round(first / seconds, 2)}
+        yield {"call": name, "pairs/s": round(rate, 2), "of plain's": round(first / seconds, 2)}
 
 
 #: Name -> part, in their order; the first must be first, as it measures a fresh process.
@@ -454,12 +454,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started = time.monotonic()
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all by default")
-    parser.add_argument("--but", nargs="*", default=[], metavar="PART", help="leave these out")
-    parser.add_argument("--smoke", action="store_true", help="a tiny size on the CPU, to see that it runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the tables as JSON, too")
-    parser.add_argument("--repeats", type=int, help="timed rounds of every comparison")
-    parser.add_argument("--sides", type=int, nargs="+", help="longer sides of the large pictures, pixels")
-    parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds after which no part begins")
+    parser.add_argument("--but", nargs="*", default=[], metavar="PART", help="parts to skip")
+    parser.add_argument("--smoke", action="store_true", help="run at a tiny size on the CPU, as a test")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the tables as JSON")
+    parser.add_argument("--repeats", type=int, help="number of timed rounds per comparison")
+    parser.add_argument("--sides", type=int, nargs="+", help="longer sides of the large images in pixels")
+    parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds after which no part starts")
     typed = parser.parse_args(arguments)
     if unknown := {*typed.parts, *typed.but} - set(PARTS):
         parser.error(f"parts are {', '.join(PARTS)}; not {', '.join(sorted(unknown))}")

@@ -21,8 +21,13 @@ STARTS = {
     "import geodiff_plugin": ("-c", "import geodiff_plugin"),
     "geodiff --version": ("-m", "geodiff_plugin", "--version"),
     "geodiff --help": ("-m", "geodiff_plugin", "--help"),
+    "geodiff depth --help": ("-m", "geodiff_plugin", "depth", "--help"),
     "GeometryGuidance": ("-c", "from geodiff_plugin import GeometryGuidance"),
     "enable_geometry_guidance": ("-c", "from geodiff_plugin import enable_geometry_guidance"),
+    "imports of geodiff depth": (
+        "-c",
+        "from geodiff_plugin.cli.app import _imported as i; i('cli.run.run_depth')",
+    ),
 }
 """Row of the table -> arguments of the interpreter."""
 
@@ -48,7 +53,7 @@ def seconds(arguments: Sequence[str], repeats: int = 3) -> float:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table; ``--help`` lists the options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--repeats", type=int, default=3, help="interpreters per line; the median counts")
+    parser.add_argument("--repeats", type=int, default=3, help="interpreters per line; the median is shown")
     options = parser.parse_args(arguments)
     table = new_table(("", "seconds"))
     for name, start in STARTS.items():

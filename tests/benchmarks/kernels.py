@@ -3,8 +3,8 @@
     python -m tests.benchmarks.kernels
 
 Data flow: kernel, types of its arguments and constants -> machine code by Triton -> a table on standard
-output. A kernel that keeps part of its registers in memory (spills) makes the command fail, and so does one
-whose programs wait for each other but would not all be on the device at the same time.
+output. The command fails if a kernel spills registers, or if programs that
+wait for each other would not all be resident at the same time.
 """
 
 from __future__ import annotations
@@ -21,25 +21,18 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from geodiff_plugin.algorithm import correction_kernels as correction
-from geodiff_plugin.algorithm import edge_kernels
-from geodiff_plugin.algorithm import kernels as algorithm
+from geodiff_plugin.algorithm.kernels import edges, match_fitting, solver
 from geodiff_plugin.cli.terminal import new_table, show
-from geodiff_plugin.matching import kernels as matching
-from geodiff_plugin.matching import reflection_kernels as reflection
-from geodiff_plugin.matching import window_kernels as window
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
-from geodiff_plugin.matching.consistency import EVERY_ROW
-from geodiff_plugin.result import exposure_kernels as exposure
-from geodiff_plugin.result import flattening_kernels as flattening
-from geodiff_plugin.result import grounds_kernels as grounds
-from geodiff_plugin.result import indicator_kernels as indicator
-from geodiff_plugin.result import kernels as result
-from geodiff_plugin.runtime import kernels as runtime
-from geodiff_plugin.scale import kernels as scale
-from geodiff_plugin.scale import search_kernels as search
-from geodiff_plugin.scale.points import BASIN_CANDIDATES
-from geodiff_plugin.scale.space import KERNEL_FORMS
+from geodiff_plugin.matching.constants import EVERY_ROW
+from geodiff_plugin.matching.kernels import aggregation, consistency, sweep, winner
+from geodiff_plugin.matching.kernels import reflections as reflection
+from geodiff_plugin.matching.kernels import windows as window
+from geodiff_plugin.result.kernels import confidence, median, planar, reprojection
+from geodiff_plugin.runtime.kernels import group_norm
+from geodiff_plugin.scale.constants import BASIN_CANDIDATES, KERNEL_FORMS
+from geodiff_plugin.scale.kernels import points, search, space
+from geodiff_plugin.trust.kernels import match_statistics as statistics
 
 #: Compute capabilities of an A100, of an H100 and of GeForce RTX 50.
 ARCHITECTURES = (80, 90, 120)
@@ -78,30 +71,30 @@ def _of_the_matching() -> Iterator[Compiled]:
     paths = "*u8 *i16 *i32 i32 i32 i32 i32 i32 i32 i32"
     for planes in (128, 256, 512, 1024, 2048, 4096):
         axes = {"DOWN": (1, 0, 1, 1), "ACROSS": (0, 1, 1, -1), "PADDED": planes}
-        warps = matching.path_warps(planes)
-        yield Compiled(f"paths, {planes} planes", matching.paths_kernel, paths, axes, warps)
-    winner = "*i32 *u8 *i1 *fp32 *fp32 *fp32 *fp32 *fp32" + 9 * " i32"
+        warps = aggregation.path_warps(planes)
+        yield Compiled(f"paths, {planes} planes", aggregation.paths_kernel, paths, axes, warps)
+    types = "*i32 *u8 *i1 *fp32 *fp32 *fp32 *fp32 *fp32" + 9 * " i32"
     for evidence, padded in ((True, 128), (False, 128), (True, 4096)):
         sizes = {"EVIDENCE": evidence, "BLOCK": max(1, 1024 // padded), "PADDED": padded}
         name = f"winner{' and evidence' if evidence else ''}, {padded} planes"
-        yield Compiled(name, matching.winner_kernel, winner, sizes, 4)
-    block = dict(zip(("BLOCK", "PLANES"), matching.COST_BLOCK, strict=True))
+        yield Compiled(name, winner.winner_kernel, types, sizes, 4)
+    block = dict(zip(("BLOCK", "PLANES"), sweep.COST_BLOCK, strict=True))
     census = {"SIDE": SIDE, "MARGIN": MARGIN_PX, "VOTE": VOTE_LEVELS}
-    sweep = "*i16 *i16 *i32 *i32 *i1 *u8 *i1" + 8 * " i32"
+    types = "*i16 *i16 *i32 *i32 *i1 *u8 *i1" + 8 * " i32"
     sizes = census | block | {"HAS_VALID": True}
-    yield Compiled("sweep", matching.census_cost_kernel, sweep, sizes, 4)
+    yield Compiled("sweep", sweep.census_cost_kernel, types, sizes, 4)
     look_up = "*u8 *i32 *u8" + 9 * " i32"
-    yield Compiled("costs of a right view", matching.look_up_kernel, look_up, block, 4)
+    yield Compiled("costs of a right view", consistency.look_up_kernel, look_up, block, 4)
     exact = {"enable_fp_fusion": False}
-    pixels: dict[str, Any] = {"BLOCK": matching.PIXELS}
+    pixels: dict[str, Any] = {"BLOCK": sweep.PIXELS}
     resample = "*fp32 *fp32 *i16" + 6 * " i32"
-    yield Compiled("shifted right views", matching.resample_kernel, resample, pixels, 4, exact)
+    yield Compiled("shifted right views", sweep.resample_kernel, resample, pixels, 4, exact)
     axes = {"DOWN": (1, 0), "ACROSS": (0, 1)}
     penalties = "*fp32 *i16 i32 i32 i32"
-    yield Compiled("penalties", matching.penalties_kernel, penalties, axes | pixels, 4, exact)
+    yield Compiled("penalties", aggregation.penalties_kernel, penalties, axes | pixels, 4, exact)
     weigh = 7 * "*fp32 " + "*i1 *fp32" + 8 * " i32" + 3 * " fp32"
     sizes = pixels | {"FIRST": False, "HAS_VALID": True, "EVERY_ROW": EVERY_ROW}
-    yield Compiled("evidence of a right view", matching.weigh_kernel, weigh, sizes, 4, exact)
+    yield Compiled("evidence of a right view", consistency.assess_kernel, weigh, sizes, 4, exact)
 
 
 def _of_the_matches() -> Iterator[Compiled]:
@@ -115,64 +108,66 @@ def _of_the_matches() -> Iterator[Compiled]:
     tile = dict(zip(("ROWS", "COLUMNS"), window.TILE, strict=True))
     yield Compiled("what matches know", window.known_kernel, 3 * "*fp32 " + "i32 i32", tile, 4)
     hidden = 3 * "*fp32 " + "*i1 " + 4 * "*fp32 " + "i32 i32"
-    yield Compiled("hidden strips", window.hidden_kernel, hidden, tile, 4)
-    yield Compiled("grounds", grounds.grounds_kernel, 7 * "*fp32 " + "i32 i32", tile, 4)
+    yield Compiled("hidden strips", window.occlusion_kernel, hidden, tile, 4)
+    yield Compiled("grounds", confidence.features_kernel, 7 * "*fp32 " + "i32 i32", tile, 4)
     marked = 6 * "*fp32 " + "i32"
-    yield Compiled("matches to sort", indicator.marked_kernel, marked, {"BLOCK": indicator.BLOCK}, 4)
-    yield Compiled("numbers of matches", indicator.numbers_kernel, 4 * "*fp32 " + "i32", {}, 1)
+    yield Compiled("matches to sort", statistics.marked_kernel, marked, {"BLOCK": statistics.BLOCK}, 4)
+    yield Compiled("numbers of matches", statistics.numbers_kernel, 4 * "*fp32 " + "i32", {}, 1)
 
 
 def _of_the_networks() -> Iterator[Compiled]:
-    sizes = {"BLOCK": runtime.BLOCK}
-    yield Compiled("group norm, moments", runtime.moments_kernel, "*bf16 *fp32 i32 i32 i32", sizes, 4)
+    sizes = {"BLOCK": group_norm.BLOCK}
+    yield Compiled("group norm, moments", group_norm.moments_kernel, "*bf16 *fp32 i32 i32 i32", sizes, 4)
     norm = "*bf16 *bf16 *fp32 *bf16 *bf16" + 6 * " i32" + " fp32"
-    sizes = sizes | {"PARTS": runtime.MOST_PARTS}
-    yield Compiled("group norm", runtime.normalise_kernel, norm, sizes, 4)
+    sizes = sizes | {"PARTS": group_norm.MAX_PARTS}
+    yield Compiled("group norm", group_norm.normalize_kernel, norm, sizes, 4)
 
 
 def _of_the_result() -> Iterator[Compiled]:
-    sizes = {"CHANNELS": 3, "BLOCK": edge_kernels.BLOCK, "PADDED": edge_kernels.PADDED}
-    sharpen, warps = "*fp32 *fp32 *fp32 i32 i32 i32", edge_kernels.WARPS
-    yield Compiled("sharp edges", edge_kernels.sharpen_kernel, sharpen, sizes, warps)
-    sizes = {"CHANNELS": 3, "BLOCK": result.BLOCK, "VOTES": result.VOTES}
+    sizes = {"CHANNELS": 3, "BLOCK": edges.BLOCK, "PADDED": edges.PADDED}
+    sharpen, warps = "*fp32 *fp32 *fp32 i32 i32 i32", edges.WARPS
+    yield Compiled("sharp edges", edges.sharpen_kernel, sharpen, sizes, warps)
+    sizes = {"CHANNELS": 3, "BLOCK": median.BLOCK, "VALUES": median.VALUES}
     vote = 11 * "*fp32 " + "fp32 fp32 i32 i32"
     enlarge, around = (
         4 * "*fp32 " + 4 * "i32 ",
-        {"CHANNELS": 3, "BLOCK": result.BLOCK, "AROUND": result.AROUND},
+        {"CHANNELS": 3, "BLOCK": median.BLOCK, "AROUND": median.AROUND},
     )
-    yield Compiled("enlarged votes", result.enlarge_kernel, enlarge, around, 4)
-    share = "*fp32 *fp32 i32 i32"
-    yield Compiled("crispness", result.share_kernel, share, {"PIXELS": result.PIXELS}, result.WARPS)
-    yield Compiled("votes", result.vote_kernel, vote, sizes, result.WARPS)
-    sizes = {"BLOCK": result.BLOCK, "IN_MEDIAN": result.IN_MEDIAN}
-    median = "*fp32 *fp32 *fp32 *fp32 *fp32 i32 i32"
-    yield Compiled("median of votes", result.median_kernel, median, sizes, result.WARPS)
-    sizes = {"SPREAD": True, "PRIOR": 2, "PIXELS": result.PIXELS}
-    confidence = 7 * "*fp32 " + "i32"
-    yield Compiled("confidence", result.confidence_kernel, confidence, sizes, 4)
-    sizes = {"CHANNELS": 3, "PIXELS": result.PIXELS}
-    yield Compiled("warp", result.warp_kernel, "*fp32 *fp32 *fp32 *fp32 *i1 i32 i32 i32 i32", sizes, 4)
+    yield Compiled("enlarged votes", median.upsample_kernel, enlarge, around, 4)
+    fraction = "*fp32 *fp32 i32 i32"
+    yield Compiled("crispness", median.fraction_kernel, fraction, {"PIXELS": median.PIXELS}, median.WARPS)
+    yield Compiled("votes", median.vote_kernel, vote, sizes, median.WARPS)
+    sizes = {"BLOCK": median.BLOCK, "IN_MEDIAN": median.IN_MEDIAN}
+    signature = "*fp32 *fp32 *fp32 *fp32 *fp32 i32 i32"
+    yield Compiled("median of votes", median.median_kernel, signature, sizes, median.WARPS)
+    sizes = {"SPREAD": True, "PRIOR": 2, "PIXELS": confidence.PIXELS}
+    types = 7 * "*fp32 " + "i32"
+    yield Compiled("confidence", confidence.confidence_kernel, types, sizes, 4)
+    sizes = {"CHANNELS": 3, "PIXELS": reprojection.PIXELS}
+    yield Compiled("warp", reprojection.warp_kernel, "*fp32 *fp32 *fp32 *fp32 *i1 i32 i32 i32 i32", sizes, 4)
 
 
 def _of_the_photometric_error() -> Iterator[Compiled]:
-    images, sizes = "*fp32 *fp32 *i1 ", {"CHANNELS": 3, "PIXELS": exposure.PIXELS}
-    yield Compiled("exposure, sums", exposure.sums_kernel, images + "*fp32 i32", sizes, 4)
-    yield Compiled("exposure, squares", exposure.squares_kernel, images + "*fp32 *fp32 i32", sizes, 4)
+    images, sizes = "*fp32 *fp32 *i1 ", {"CHANNELS": 3, "PIXELS": reprojection.PIXELS}
+    yield Compiled("exposure, sums", reprojection.sums_kernel, images + "*fp32 i32", sizes, 4)
+    yield Compiled("exposure, squares", reprojection.squares_kernel, images + "*fp32 *fp32 i32", sizes, 4)
     cells = images + "*fp32 *fp32 *fp32 i32 i32"
-    yield Compiled("exposure, cells", exposure.cells_kernel, cells, sizes, 4)
+    yield Compiled("exposure, cells", reprojection.cells_kernel, cells, sizes, 4)
     error = 6 * "*fp32 " + "i32 i32"
-    yield Compiled("photometric error", exposure.error_kernel, error, sizes, 4)
+    yield Compiled("photometric error", reprojection.error_kernel, error, sizes, 4)
 
 
 def _of_the_scale() -> Iterator[Compiled]:
     refine = "*fp32 *i64 " + 7 * "*fp32 " + 7 * "i32 "
     for block in (1024, 16384):
-        sizes = {"FORM": KERNEL_FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
-        yield Compiled(f"refinement, {block} matches", scale.refine_kernel, refine, sizes, scale.warps(block))
+        sizes = {"FORM": KERNEL_FORMS["depth"], "BLOCK": block, "CHUNK": points.CHUNK}
+        yield Compiled(
+            f"refinement, {block} matches", points.refine_kernel, refine, sizes, points.warps(block)
+        )
 
-    sizes = {"MAKES": scale.RELATIVE, "FORM": KERNEL_FORMS["log1p"], "CLIPPED": False, "RAW": True}
-    sizes |= {"PIXELS": scale.PIXELS}
-    yield Compiled("metric and relative maps", scale.map_kernel, 5 * "*fp32 " + "i32", sizes, 4)
+    sizes = {"MODE": space.RELATIVE, "FORM": KERNEL_FORMS["log1p"], "CLIPPED": False, "RAW": True}
+    sizes |= {"PIXELS": space.PIXELS}
+    yield Compiled("metric and relative maps", space.map_kernel, 5 * "*fp32 " + "i32", sizes, 4)
     sizes = {"FORM": KERNEL_FORMS["depth"], "CLIPPED": False, "GRID": BASIN_CANDIDATES, "BLOCK": search.BLOCK}
     basin = "*fp32 *i64 " + 8 * "*fp32 " + 7 * "i32 "
     yield Compiled("search by points", search.basin_kernel, basin, sizes, 4)
@@ -188,33 +183,35 @@ def _of_the_scale() -> Iterator[Compiled]:
 
 def _of_the_solver() -> Iterator[Compiled]:
     solve = 13 * "*fp32 " + "*i32 fp32" + 13 * " i32"
-    options = {"maxnreg": algorithm.MOST_REGISTERS, "launch_cooperative_grid": True}
+    options = {"maxnreg": solver.MAX_REGISTERS, "launch_cooperative_grid": True}
     for robust, name in ((False, "fields"), (True, "robust fields")):
-        sizes = {"ROBUST": robust, "TILE": algorithm.TILE, "ALONE": algorithm.ALONE}
-        many = solve, sizes, algorithm.WARPS, options, algorithm.RESIDENT
-        yield Compiled(name, algorithm.solve_kernel, *many)
+        sizes = {"ROBUST": robust, "TILE": solver.TILE, "ALONE": solver.ALONE}
+        many = solve, sizes, solver.WARPS, options, solver.RESIDENT
+        yield Compiled(name, solver.solve_kernel, *many)
 
 
 def _of_the_fit() -> Iterator[Compiled]:
-    block: dict[str, Any] = {"BLOCK": correction.BLOCK}
-    links = 4 * "*fp32 " + "i32 i32 fp32"
-    yield Compiled("links", correction.links_kernel, links, block | {"CHANNELS": 3}, 4)
+    block: dict[str, Any] = {"BLOCK": match_fitting.BLOCK}
+    affinities = 4 * "*fp32 " + "i32 i32 fp32"
+    yield Compiled("links", match_fitting.affinities_kernel, affinities, block | {"CHANNELS": 3}, 4)
     observe = 7 * "*fp32 " + "i32 i32 fp32"
-    yield Compiled("residuals of matches", correction.observe_kernel, observe, block, 4)
-    sizes = {"CHUNK": correction.CHUNK}
+    yield Compiled("residuals of matches", match_fitting.observe_kernel, observe, block, 4)
+    sizes = {"CHUNK": match_fitting.CHUNK}
     spread = 5 * "*fp32 " + "i32 i32"
-    yield Compiled("spread of residuals", correction.spread_kernel, spread, sizes, correction.SPREAD_WARPS)
-    yield Compiled("levels of a fit", correction.levels_kernel, "*fp32 *fp32 *fp32 i32 fp32", block, 4)
-    edges = 4 * "*fp32 " + 4 * "i32 "
-    yield Compiled("matches off edges", correction.off_edges_kernel, edges, block, 4)
+    yield Compiled(
+        "spread of residuals", match_fitting.spread_kernel, spread, sizes, match_fitting.SPREAD_WARPS
+    )
+    yield Compiled("levels of a fit", match_fitting.levels_kernel, "*fp32 *fp32 *fp32 i32 fp32", block, 4)
+    off_edges = 4 * "*fp32 " + 4 * "i32 "
+    yield Compiled("matches off edges", match_fitting.off_edges_kernel, off_edges, block, 4)
 
 
 def _of_the_flattening() -> Iterator[Compiled]:
-    block = {"BLOCK": flattening.BLOCK}
+    block = {"BLOCK": planar.BLOCK}
     tile = dict(zip(("ROWS", "COLUMNS"), window.TILE, strict=True))
-    yield Compiled("known shape", flattening.known_kernel, 10 * "*fp32 " + "i32 i32", tile, 4)
-    yield Compiled("slopes", flattening.slopes_kernel, 6 * "*fp32 " + "i32 i32", block, 4)
-    yield Compiled("pull of the slopes", flattening.forces_kernel, 5 * "*fp32 " + "i32 i32", block, 4)
+    yield Compiled("known shape", planar.known_kernel, 10 * "*fp32 " + "i32 i32", tile, 4)
+    yield Compiled("slopes", planar.slopes_kernel, 6 * "*fp32 " + "i32 i32", block, 4)
+    yield Compiled("pull of the slopes", planar.forces_kernel, 5 * "*fp32 " + "i32 i32", block, 4)
 
 
 def resources(launch: Compiled, architecture: int) -> tuple[int, int]:
@@ -230,8 +227,8 @@ def resources(launch: Compiled, architecture: int) -> tuple[int, int]:
         file = Path(folder) / "kernel.cubin"
         file.write_bytes(cubin)
         command = [str(_CUOBJDUMP), "--dump-resource-usage", str(file)]
-        told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    used = {name: int(count) for name, count in re.findall(r"(\w+):(\d+)", told)}
+        reported = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    used = {name: int(count) for name, count in re.findall(r"(\w+):(\d+)", reported)}
     return used["REG"], used["STACK"] + used["LOCAL"]
 
 

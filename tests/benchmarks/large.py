@@ -1,12 +1,11 @@
 """Peak memory of ``geodiff depth`` on large pairs: ``python -m tests.benchmarks.large``.
 
-Data flow: a rendered pair of W x H -> the command in a process of its own -> resident memory by stage, error,
-    judgement.
+Data flow: a rendered pair of W x H -> the command in its own process -> resident memory by stage, error,
+    verdict.
 
-The scene is known in closed form: a wall that leans back, and a panel that hangs before it, in a texture
-with detail at every size, so that a picture of any number of pixels costs one look-up a pixel. The wall is
-nearer at the bottom, as most scenes are. With an overhanging wall the prior confuses near and far, as if the
-two images were exchanged, and the run is not trusted however well the views match.
+The scene has a closed form: a wall that leans back, and a panel in front of it. Their texture has detail at
+every scale, so that an image of any size costs one look-up per pixel. The wall is nearer at the bottom, as in
+most scenes. With an overhanging wall the prior inverts near and far, and the run is not trusted.
 """
 
 from __future__ import annotations
@@ -145,13 +144,13 @@ def abs_rel(folder: Path, size: tuple[int, int]) -> float:
     depth_m, total = np.load(folder / "out" / "depth.npy", mmap_mode="r"), 0.0
     for top in range(0, size[1], STRIP):
         rows = range(top, min(top + STRIP, size[1]))
-        truth = depth_strip(size, rows)[0]
-        total += float(np.abs(depth_m[rows.start : rows.stop] / truth - 1).sum())
+        ground_truth = depth_strip(size, rows)[0]
+        total += float(np.abs(depth_m[rows.start : rows.stop] / ground_truth - 1).sum())
     return total / (size[0] * size[1])
 
 
 def is_trusted(folder: Path) -> bool:
-    """What the judgement said, by ``out/report.json``."""
+    """Return the verdict in ``out/report.json``."""
     report = json.loads((folder / "out" / "report.json").read_text(encoding="utf-8"))
     return bool(report["verdict"]["status"] == "trusted")
 
@@ -159,7 +158,7 @@ def is_trusted(folder: Path) -> bool:
 def main(argv: list[str] | None = None) -> None:
     """Print seconds and peak memory by stage for every size."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", action="append", help="WxH; by default 4000x3000 and 8000x6000")
+    parser.add_argument("--size", action="append", help="WxH (default: 4000x3000 and 8000x6000)")
     parser.add_argument("--json", action="store_true", help="print one JSON document instead")
     options = parser.parse_args(argv)
     sizes = [tuple(int(side) for side in text.split("x")) for text in options.size or []] or SIZES
@@ -170,15 +169,16 @@ def main(argv: list[str] | None = None) -> None:
             write_large_pair(folder, size)
             with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
                 stages = fresh_process.submit(measure_depth, folder).result()
-            told = {"abs_rel": abs_rel(folder, size), "trusted": is_trusted(folder)}
-            answers.append({"size": size, **told, "stages": stages})
+            reported = {"abs_rel": abs_rel(folder, size), "trusted": is_trusted(folder)}
+            answers.append({"size": size, **reported, "stages": stages})
             if options.json:
                 continue
             peak, pixels = max(stage["peak_mb"] for stage in stages.values()), size[0] * size[1]
             own = (peak - stages["start"]["peak_mb"]) * 1e6 / pixels
-            judged = "trusted" if told["trusted"] else "not to be trusted"
+            judged = "trusted" if reported["trusted"] else "not to be trusted"
             print(
-                f"{size[0]}x{size[1]}, {pixels / 1e6:.0f} megapixels, AbsRel {told['abs_rel']:.4f}, {judged}"
+                f"{size[0]}x{size[1]}, {pixels / 1e6:.0f} megapixels, AbsRel "
+                f"{reported['abs_rel']:.4f}, {judged}"
             )
             for stage, used in stages.items():
                 print(f"  {stage:12} {used['seconds']:8.1f} s {used['peak_mb']:9.0f} MB")

@@ -1,13 +1,14 @@
-"""Torch operations and kernel launches of a guided call on the code path of CUDA, counted without a card.
+"""Count torch operations and kernel launches of a guided call on the CUDA code path, without a GPU.
 
     python -m tests.benchmarks.launches
 
-Data flow: the demo pair, a narrow Marigold with random weights -> operations of every stage, networks apart.
+Data flow: the demo pair, a narrow Marigold with random weights -> operations per stage, without networks.
+``--without all`` prints instead how many operations each module of kernels saves, ``--without MODULE`` one.
 
-On a GPU the host sends one operation after the other, and where they are small their number is the time.
-Stages run as on CUDA, but a kernel's launch is counted and not made; what such a stage returns is its
-reference's result, which is not counted. The host's own operations on cameras are counted as well: they take
-as long. Views, which launch nothing, are shown apart.
+On a GPU the host launches operations one by one, so the number of small operations determines the time.
+Stages run as on CUDA, but kernel launches are counted instead of executed, and the reference computes the
+result without being counted. Operations of the host on cameras are counted too, because they take as long.
+Views, which launch nothing, are listed separately.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ import functools
 import statistics
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 from unittest.mock import patch
 
@@ -28,7 +29,7 @@ from diffusers.utils import logging as diffusers_logging
 from torch.utils._python_dispatch import TorchDispatchMode
 from triton.runtime.jit import KernelInterface
 
-from geodiff_plugin import _kernels
+from geodiff_plugin._internal import kernels as _kernels
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.cli.terminal import new_table, show
@@ -37,48 +38,19 @@ from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from tests.benchmarks.cost import resized_pair
 from tests.benchmarks.measuring import holders
 from tests.benchmarks.random_marigold import random_marigold
+from tests.stages import stages
 
 __all__ = ["Counted", "count_guided_call", "host_milliseconds"]
 
-#: Functions that choose between a kernel and its reference: pure functions of tensors.
-WITH_KERNELS = (
-    "sweep_planes",
-    "match_volume",
-    "solve_field",
-    "smooth_floor",
-    "MetricMap.__call__",
-    "MetricMap.relative",
-    "solve_robust",
-    "edge_links",
-    "_residuals",
-    "_spread",
-    "_levels",
-    "off_edges",
-    "_towards_smoothed",
-    "_best_range",
-    "fit_to_points",
-    "refine_to_matches",
-    "sharpen_edges",
-    "_step_shares",
-    "_voted",
-    "_enlarged",
-    "_warped",
-    "_photometric_error",
-    "depth_confidence",
-    "reject_reflections",
-    "_of_matches_and_depth",
-    "known_share",
-    "with_hidden",
-    "_grounds_on_grid",
-    "_known_of",
-)
+#: Functions that have a kernel, which are pure functions of tensors, with the module of the kernel.
+WITH_KERNELS = {stage.name: stage.kernel.rpartition(".")[0] for stage in stages()}
 #: Functions, and methods as ``Class.method``, whose operations are shown apart; each without those below it.
 STAGES = (
     "clean",
     "measure_fit",
-    "refine_views",
+    "check_poses",
     "build_cost_volume",
-    "pilot_volume",
+    "coarse_volume",
     "sweep_planes",
     "match_volume",
     "inverse_pose_preferred",
@@ -89,16 +61,16 @@ STAGES = (
     "refine_to_matches",
     "reject_reflections",
     "prior_error",
-    "correction_target",
+    "fit_target",
     "fit_depth",
     "solve_field",
     "solve_robust",
     "finish",
     "sharpen_edges",
-    "vote_depth",
+    "filter_depth",
     "reprojection",
     "depth_confidence",
-    "measure_indicators",
+    "measure_result",
     "stack_results",
 )
 #: What belongs to no stage: the host's loop, resizing, and the hooks of the call.
@@ -111,13 +83,28 @@ class Counted:
 
     Attributes:
         operations: torch operations, views among them.
-        views: operations that only describe a tensor anew.
+        views: operations that only describe a tensor again.
         launches: of Triton kernels.
     """
 
     operations: Counter[str] = field(default_factory=Counter)
     views: Counter[str] = field(default_factory=Counter)
     launches: Counter[str] = field(default_factory=Counter)
+
+
+def _fill(made: Any, values: Any) -> None:
+    """Give what a kernel has allocated, in its layout and number type, the values of the reference."""
+    if isinstance(made, torch.Tensor):
+        made.copy_(values)
+    elif isinstance(made, dict):
+        for name in made:
+            _fill(made[name], values[name])
+    elif isinstance(made, (tuple, list)):
+        for one, other in zip(made, values, strict=True):
+            _fill(one, other)
+    elif is_dataclass(made):
+        for each in fields(made):
+            _fill(getattr(made, each.name), getattr(values, each.name))
 
 
 class _Watching:
@@ -171,14 +158,16 @@ class _Watching:
         return own
 
     def by_reference(self, own: Callable[..., Any]) -> Callable[..., Any]:
-        """The function watched with its kernels, whose launches change nothing; its reference's result."""
+        """The function watched with its kernel, whose launches change nothing; the reference's values."""
 
         @functools.wraps(own)
         def call(*args: Any, **kwargs: Any) -> Any:
-            if not self._off:
-                own(*args, **kwargs)
+            made = None if self._off else own(*args, **kwargs)
             with self.off(), _kernels.without_kernels():
-                return own(*args, **kwargs)
+                expected = own(*args, **kwargs)
+                if made is not None:
+                    _fill(made, expected)
+            return expected if made is None else made
 
         return call
 
@@ -188,11 +177,26 @@ class _Watching:
 
 
 class Counting(_Watching, TorchDispatchMode):
-    """Counts the operations of this thread into the stage that runs."""
+    """Counts the operations of this thread into the stage that runs.
 
-    def __init__(self) -> None:
+    Args:
+        without: a module whose kernels are off: the operations of their references are counted.
+    """
+
+    def __init__(self, without: str | None = None) -> None:
         super().__init__()
-        self.counted = Counted()
+        self.counted, self._without = Counted(), without
+
+    def by_reference(self, own: Callable[..., Any]) -> Callable[..., Any]:
+        if WITH_KERNELS[own.__qualname__] != self._without:
+            return super().by_reference(own)
+
+        @functools.wraps(own)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            with _kernels.without_kernels():
+                return own(*args, **kwargs)
+
+        return call
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if not self._off:
@@ -284,14 +288,15 @@ def guided_demo_call(pipe: Any, side: int | None, **options: Any) -> Callable[[]
     return lambda: pipe(left, guidance=guidance, generator=generator.manual_seed(0), **options)
 
 
-def count_guided_call(resolution: int = 768, side: int | None = None) -> Counted:
+def count_guided_call(resolution: int = 768, side: int | None = None, without: str | None = None) -> Counted:
     """Operations and launches of one guided call of the demo pair, without its networks.
 
     Args:
         resolution: longer side of what the prior works on, pixels.
-        side: longer side of the photographs, pixels; ``None`` for the demo pair's own.
+        side: longer side of the images, pixels; ``None`` for the demo pair's own.
+        without: a module whose kernels are off, below the package.
     """
-    pipe, counting = enable_geometry_guidance(random_marigold(width=0.01)), Counting()
+    pipe, counting = enable_geometry_guidance(random_marigold(width=0.01)), Counting(without)
     call = guided_demo_call(pipe, side, processing_resolution=resolution, num_inference_steps=4)
     with as_on_cuda(counting, pipe):
         call()
@@ -301,7 +306,7 @@ def count_guided_call(resolution: int = 768, side: int | None = None) -> Counted
 def host_milliseconds(side: int = 160, repeats: int = 15) -> dict[str, float]:
     """Median milliseconds of the host in a guided call of the bundled prior, by stage, without its networks.
 
-    They are those of one thread, which the machine's other work does not lengthen. On pictures this small
+    They count one thread's CPU time, which other work on the machine does not lengthen. On images this small
     torch's operations take the time of their dispatch. What OpenCV does in threads of its own is not seen.
     """
     pipe = enable_geometry_guidance(load_bundled_prior())
@@ -314,27 +319,53 @@ def host_milliseconds(side: int = 160, repeats: int = 15) -> dict[str, float]:
     return {stage: statistics.median(each[stage] for each in taken[1:]) for stage in (*STAGES, ELSEWHERE)}
 
 
+def _show_saved(modules: Sequence[str], resolution: int) -> None:
+    """Print what the kernels of some modules save."""
+
+    def counts(without: str | None) -> tuple[int, int]:
+        found = count_guided_call(resolution, without=without)
+        return found.operations.total() - found.views.total(), found.launches.total()
+
+    table, (operations, launches) = (
+        new_table(("kernels", "operations saved", "Triton launches")),
+        counts(None),
+    )
+    for module in modules:
+        references, others = counts(module)
+        table.add_row(module, str(references - operations), str(launches - others))
+    show(table)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--resolution", type=int, default=768, help="longer side of the map, pixels")
-    parser.add_argument("--host", action="store_true", help="the host's milliseconds instead, bundled prior")
+    parser.add_argument("--resolution", type=int, default=768, help="longer side of the map in pixels")
+    parser.add_argument(
+        "--host", action="store_true", help="measure milliseconds of the host with the bundled prior instead"
+    )
+    every = sorted({*WITH_KERNELS.values()})
+    parser.add_argument(
+        "--without", choices=["all", *every], help="count the operations that these kernels save instead"
+    )
     diffusers_logging.set_verbosity_error()
     typed = parser.parse_args()
+    if typed.without:
+        _show_saved(every if typed.without == "all" else [typed.without], typed.resolution)
+        return
     if typed.host:
         torch.set_num_threads(1)
         table = new_table(("stage", "ms"))
         found = host_milliseconds()
-        for stage, milliseconds in (*found.items(), ("in all", sum(found.values()))):
+        for stage, milliseconds in (*found.items(), ("total", sum(found.values()))):
             table.add_row(stage, f"{milliseconds:.2f}")
         show(table)
         return
     counted = count_guided_call(typed.resolution)
-    table = new_table(("stage", "operations", "of them views", "Triton launches"))
+    table = new_table(("stage", "operations", "of these, views", "Triton launches"))
     parts = counted.operations, counted.views, counted.launches
     for stage in (*STAGES, ELSEWHERE):
         table.add_row(stage, *(str(each[stage]) for each in parts))
-    table.add_row("in all", *(str(each.total()) for each in parts))
+    table.add_row("total", *(str(each.total()) for each in parts))
     show(table)
 
 

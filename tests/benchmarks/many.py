@@ -1,4 +1,4 @@
-"""What ``geodiff depth`` on many pairs gains by stages side by side: the same pairs, one after the other.
+"""Gain from overlapping the stages of ``geodiff depth`` on many pairs, compared with one pair at a time.
 
 Data flow: rendered pairs in two folders -> the stages of the command, overlapped and not -> a table
     (``python -m tests.benchmarks.many``); with ``--engine ray``, the command by one process and by Ray.
@@ -85,7 +85,7 @@ class ManyPairs:
         self._options, self._refs = options, start_many(options)
         self._device = pick_device(options.device)
         self._pipe = load_guided_prior(options.prior, self._device) if pipe is None else pipe
-        self._stages = dict[int, Stages]()  # kept: beside a GPU each starts processes
+        self._stages = dict[int, Stages]()  # kept: next to a GPU each starts processes
 
     def close(self) -> None:
         """End what the stages have opened and started."""
@@ -124,10 +124,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--pairs", type=int, default=6)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--prior", default="bundled")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="rows for each")
-    parser.add_argument("--repeats", type=int, default=3, help="the ways in turn; the median counts")
-    parser.add_argument("--engine", choices=ENGINES, default="local", help="ray: compare the engines instead")
-    parser.add_argument("--workers", type=int, default=2, help="of Ray")
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads, rows for each"
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=3, help="number of alternating runs; the median is shown"
+    )
+    parser.add_argument("--engine", choices=ENGINES, default="local", help="ray: compare the engines")
+    parser.add_argument("--workers", type=int, default=2, help="number of Ray workers")
     options = parser.parse_args(arguments)
     if options.engine == "ray":
         from tests.benchmarks.engines import RENDERED, compare_engines, repeat_pairs  # ray

@@ -1,6 +1,6 @@
-"""Another model's depth map as the prior: five kinds, exact to blurred, relative and metric, with holes.
+"""Depth maps as the prior: five kinds, from exact to blurred, relative and metric, with holes.
 
-Data flow: rendered pairs, their true depth made worse -> AbsRel of the map with the best scale and shift, and
+Data flow: rendered pairs, their degraded ground truth -> AbsRel of the map with the best scale and shift, and
 of the guided result -> table.
 
     python -m tests.benchmarks.maps --data synthetic:12
@@ -30,7 +30,7 @@ BLOCK = 40
 
 
 class Kind(NamedTuple):
-    """A kind of map: its space, and how it is made of a pair with dense truth."""
+    """A kind of map: its space, and how it is made of a pair with dense ground truth."""
 
     title: str
     space: str
@@ -39,8 +39,11 @@ class Kind(NamedTuple):
 
 def _metric(sample: StereoSample, strength: str) -> np.ndarray:
     """Depth in metres with the error of a strength."""
-    relative, truth = relative_map(sample, STRENGTHS[strength], "log"), filled(sample.depth_m, sample.valid)
-    low, high = np.quantile(np.log(truth), (0.0, 1.0))
+    relative, ground_truth = (
+        relative_map(sample, STRENGTHS[strength], "log"),
+        filled(sample.depth_m, sample.valid),
+    )
+    low, high = np.quantile(np.log(ground_truth), (0.0, 1.0))
     return np.exp(low + relative * (high - low))
 
 
@@ -67,15 +70,15 @@ KINDS = (
 
 
 def _error_of_map(sample: StereoSample, kind: Kind, depth_map: np.ndarray) -> float:
-    """AbsRel of the map where it is known, with the scale and shift in its space that fit the truth best."""
+    """AbsRel of the map where it is known, after the best-fit scale and shift in its space."""
     known = sample.valid & np.isfinite(depth_map)
-    truth = sample.depth_m[known]
-    target = 1.0 / truth if kind.space == "disparity" else truth
+    ground_truth = sample.depth_m[known]
+    target = 1.0 / ground_truth if kind.space == "disparity" else ground_truth
     A = np.stack([depth_map[known], np.ones(known.sum())], 1)
     weight = 1.0 / target  # relative errors
     fit = A @ np.linalg.lstsq(A * weight[:, None], target * weight, rcond=None)[0]
     depth = 1.0 / np.clip(fit, 1e-3, None) if kind.space == "disparity" else fit
-    return float(np.abs(depth / truth - 1.0).mean())
+    return float(np.abs(depth / ground_truth - 1.0).mean())
 
 
 def measure(samples: Sequence[StereoSample]) -> list[tuple[str, float, float, float, int]]:
@@ -106,7 +109,9 @@ def measure(samples: Sequence[StereoSample]) -> list[tuple[str, float, float, fl
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table; ``--help`` lists the options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", default="synthetic:12", help="synthetic:N, or a folder with dense truth")
+    parser.add_argument(
+        "--data", default="synthetic:12", help="synthetic:N, or a folder with dense ground truth"
+    )
     samples = [load(ref) for ref in find_pairs(parser.parse_args(arguments).data)]
     torch.set_num_threads(1)
     print("| map | AbsRel, fitted to the truth | guided | confidence | trusted |")

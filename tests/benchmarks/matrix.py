@@ -1,6 +1,6 @@
-"""Speed and deviation of a guided call under the host's switches (compile, bfloat16, slicing, offload).
+"""Speed and deviation of a guided call with options of diffusers (compile, bfloat16, slicing, offload).
 
-Data flow: a prior, the demo pair -> the same call with each switch -> ratio of seconds, largest deviation.
+Data flow: a prior, the demo pair -> the same call with each option -> ratio of seconds, largest deviation.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ CUDA_ONLY = ("model offload",)
 
 
 def deviation(found: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """Mean and greatest deviation of two metric maps, as a share of the second."""
+    """Mean and greatest deviation of two metric maps, as a fraction of the second."""
     off = np.abs(found / reference - 1.0)
     return float(off.mean()), float(off.max())
 
@@ -76,8 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:N or mps")
     parser.add_argument("--prior", default="bundled")
-    parser.add_argument("--switches", nargs="*", choices=SWITCHES, help="all by default")
-    parser.add_argument("--repeats", type=int, default=2, help="calls after the first")
+    parser.add_argument("--switches", nargs="*", choices=SWITCHES, help="options to measure (default: all)")
+    parser.add_argument("--repeats", type=int, default=2, help="number of calls after the first")
     typed = parser.parse_args(arguments)
     diffusers_logging.set_verbosity_error()
     device = pick_device(typed.device)

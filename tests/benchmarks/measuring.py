@@ -53,7 +53,7 @@ class Cost:
 
     Attributes:
         milliseconds: the median of several calls.
-        fastest_ms: the least of them, which says more where other work slows the host down now and then.
+        fastest_ms: the least of them, which is more robust if other work slows the host down occasionally.
         peak_bytes: most memory, as ``PeakMemory`` counts it.
         traced: on CUDA only.
     """

@@ -1,7 +1,7 @@
 """Memory of every prior at full size, counted with fake tensors.
 
 Data flow: architecture -> one step under ``FakeTensorMode``
-    -> bytes of weights, and of what lives beside them.
+    -> bytes of weights and of activations.
 
 Run ``python -m tests.benchmarks.memory [KEY ...]`` for the table of docs/reference/priors.md.
 """
@@ -52,10 +52,10 @@ class Memory:
     Attributes:
         parameters: number of them.
         weights: bytes of them.
-        plain: beside the weights at the peak of an unguided step and decode.
+        plain: next to the weights at the peak of an unguided step and decode.
         denoised: the same with the gradient from the map to the clean latent.
         full: with the gradient through the network to z_t; ``None`` where the network sees none.
-        four_bit_weights: bytes of the weights where the prior may keep its LoRA beside a base in 4 bits.
+        four_bit_weights: bytes of the weights where the prior may keep its LoRA next to a base in 4 bits.
     """
 
     parameters: int
@@ -119,7 +119,7 @@ def _step(pipe: Any, image: Tensor, with_graph: bool) -> tuple[Tensor, Tensor]:
 
 
 def _peak(pipe: Any, prior: Any, gradient: str | None, weights: Sequence[Tensor]) -> int:
-    """Most bytes beside the weights in one step of one sample, ``gradient`` as in ``GeometryGuidance``."""
+    """Most bytes next to the weights in one step of one sample, ``gradient`` as in ``GeometryGuidance``."""
     gc.collect()
     with _LiveBytes(weights) as counted:
         image = torch.zeros(1, 3, *SIZE, dtype=DTYPE)
@@ -166,7 +166,7 @@ def count_memory(key: str) -> Memory:
 
 
 def four_bit_bytes(transformer: torch.nn.Module, rank: int = LORA_RANK) -> int:
-    """Bytes of a transformer of Marigold V2 as its authors hold it: NF4, and a LoRA beside it in float32.
+    """Bytes of a transformer of Marigold V2 as its authors hold it: NF4, and a LoRA next to it in float32.
 
     Args:
         transformer: the base, of any dtype.

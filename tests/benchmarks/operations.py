@@ -1,4 +1,4 @@
-"""Ways of calling a Marigold, and the operations that each computes.
+"""Count the operations of several ways to call a Marigold pipeline.
 
 Data flow: a way and a size -> calls of each network; networks without data -> operations of each call.
 Paper: S5.4 (cost).
@@ -47,12 +47,12 @@ __all__ = [
 WAYS: dict[str, dict[str, Any] | None] = {
     "plain": None,
     "guided": {},
-    "guided, every step corrected": {"corrections": 10_000},
+    "guided, matches fitted at every step": {"match_fits": 10_000},
     "guided, tiny decoder": {"decoder": TINY},
     "Marigold-DC": {},
 }
 PLAIN, MARIGOLD_DC = next(iter(WAYS)), list(WAYS)[-1]
-#: Points of Marigold-DC's loop, drawn from the demo pair's truth.
+#: Points of Marigold-DC's loop, drawn from the demo pair's ground truth.
 POINTS = 500
 #: Where the calls of a way are counted: nothing of it depends on the size.
 COUNTED_WIDTH, COUNTED_RESOLUTION = 0.05, 64
@@ -72,7 +72,7 @@ class Size:
         steps: denoising steps of all ways but Marigold-DC.
         dc_steps: of Marigold-DC; 50 are published.
         dtype: of the networks.
-        repeats: calls after the first one, of which the fastest tells the seconds; 0: the first one does.
+        repeats: calls after the first one, the fastest of which is timed; 0 times the first one.
     """
 
     width: float = 1.0
@@ -102,8 +102,8 @@ def call_of(way: str, pipe: Any, size: Size, folder: str) -> Callable[[], Any]:
         points = draw_points(pair, POINTS).astype(np.float32)
         options["guidance"] = GeometryGuidance.marigold_dc(points, pair.rig.K_left)
     elif way != PLAIN:
-        knobs = {name: folder if value == TINY else value for name, value in WAYS[way].items()}
-        options["guidance"] = GeometryGuidance(pair.right, *cameras, **knobs)
+        parameters = {name: folder if value == TINY else value for name, value in WAYS[way].items()}
+        options["guidance"] = GeometryGuidance(pair.right, *cameras, **parameters)
     return lambda: pipe(pair.left, generator=torch.Generator("cpu").manual_seed(0), **options)
 
 
@@ -162,7 +162,7 @@ def count_operations(size: Size) -> dict[str, int]:
     """Floating-point operations of one call of each kind, by tensors without data.
 
     Args:
-        size: width and resolution; the picture is 4:3.
+        size: width and resolution; the image is 4:3.
     """
     height, width = round(0.75 * size.resolution / 64) * 64, round(size.resolution / 64) * 64
     with torch.device("meta"):

@@ -1,8 +1,8 @@
-"""Peak memory of the page's process while it runs one pair, by the size of its photographs.
+"""Peak memory of the web app's process while it runs one pair, by image size.
 
 python -m tests.benchmarks.page --megapixels 4,16
 
-A real pair of the package is scaled to each size and run as a visitor's, in a process of its own.
+A bundled real pair is scaled to each size and run like a visitor's pair, in its own process.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ def _run_one(megapixels: float) -> dict[str, float]:
     from PIL import Image
 
     from geodiff_plugin import read_calibration
-    from geodiff_plugin.app import page, results
-    from geodiff_plugin.app.job import CameraFields, Priors, options_of, run_job
-    from geodiff_plugin.app.shown import shown_of
+    from geodiff_plugin.app import page
+    from geodiff_plugin.app.job import CameraFields, Priors, request_of, run_job, write_job
+    from geodiff_plugin.app.sessions import Result
+    from geodiff_plugin.app.shown import clean_report, shown_of
     from geodiff_plugin.bundled.demo_pair import REAL_PAIRS_FOLDER
 
     folder, source = Path(tempfile.mkdtemp()), REAL_PAIRS_FOLDER / "toy"
     tempfile.tempdir = str(folder)
-    photographs = {side: Image.open(source / f"{side}.png").convert("RGB") for side in ("left", "right")}
-    width, height = photographs["left"].size
+    images = {side: Image.open(source / f"{side}.png").convert("RGB") for side in ("left", "right")}
+    width, height = images["left"].size
     factor = (megapixels * 1e6 / (width * height)) ** 0.5
-    for side, photograph in photographs.items():
-        photograph.resize((round(factor * width), round(factor * height))).save(folder / f"{side}.png")
+    for side, image in images.items():
+        image.resize((round(factor * width), round(factor * height))).save(folder / f"{side}.png")
     rig = read_calibration(source / "calib.txt")
     (fx, _, cx), (_, fy, cy), _ = (row.tolist() for row in rig.K_left)
     lens = {"fx": factor * fx, "fy": factor * fy}
@@ -46,11 +47,13 @@ def _run_one(megapixels: float) -> dict[str, float]:
     priors = Priors(("bundled",), torch.device("cpu"))
     priors.get("bundled")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
-    left, right = (str(folder / f"{side}.png") for side in photographs)
+    left, right = (str(folder / f"{side}.png") for side in images)
     cameras = CameraFields("numbers", lens=lens, baseline=float(rig.E[0, 3]))
-    options = options_of(left, right, cameras, **RUN)
-    shown = shown_of(run_job(options, priors, threading.Event(), lambda share, stage: None))
-    page._drawn(shown, [], results.files_of(shown))
+    request = request_of(left, right, cameras, **RUN)
+    job = run_job(request, priors, threading.Event(), lambda fraction, stage: None)
+    shown = shown_of(job, request.name)
+    list(page.drawn(Result(shown)))
+    clean_report(write_job(job))
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
     return {"megapixels": shown.depth_m.size / 1e6, "prior_mib": before, "peak_mib": after}
 
@@ -58,7 +61,7 @@ def _run_one(megapixels: float) -> dict[str, float]:
 def main() -> None:
     """Print a line for each size."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--megapixels", default="4,16", help="sizes, separated by commas")
+    parser.add_argument("--megapixels", default="4,16", help="sizes in megapixels, separated by commas")
     parser.add_argument("--one", type=float, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one is not None:

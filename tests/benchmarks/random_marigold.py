@@ -1,4 +1,4 @@
-"""Marigold v1-1 with random weights, to measure what it costs without a download.
+"""Marigold v1-1 with random weights, to measure its cost without a download.
 
 Data flow: a seed -> ``MarigoldDepthPipeline`` of 866 M (U-Net) and 84 M (VAE) parameters, or a narrower one.
 Paper: S5.1 (the prior of the experiments).
@@ -84,7 +84,7 @@ def random_marigold(
 
 
 def random_tiny(seed: int = 0, width: float = 1.0) -> AutoencoderTiny:
-    """A tiny autoencoder of TAESD's size, random weights; ``width`` is the share of its channels."""
+    """A tiny autoencoder of TAESD's size, random weights; ``width`` is the fraction of its channels."""
     channels = (max(8, round(width * TINY_WIDTH)),) * 4
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

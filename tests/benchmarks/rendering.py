@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from tests.scenes.layouts import KINDS, sample_scene
 from tests.scenes.mono import render_mono
 from tests.scenes.pairs import render_pair
@@ -65,10 +65,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--sizes", nargs="+", default=["96x128", "192x256"], metavar="HxW")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--scenes", type=int, default=24)
-    parser.add_argument(
-        "--kind", choices=KINDS, default=None, help="one kind of scene instead of the mixture"
-    )
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads")
+    parser.add_argument("--kind", choices=KINDS, default=None, help="kind of scene (default: all)")
+    parser.add_argument("--threads", type=int, default=1, help="number of CPU threads")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
     table = Table(title=f"scenes per second on {args.device}, {args.threads} CPU thread(s)")

@@ -1,8 +1,8 @@
-"""Two matchers for the rows of rectified pairs, OpenCV's and the sweep's aggregation, against the truth.
+"""Two matchers for the rows of rectified pairs, OpenCV's and the sweep's aggregation, against ground truth.
 
     python -m tests.benchmarks.rows DATA
 
-Data flow: rectified pairs with truth -> shifts of both, at the size at which rows are matched -> a table of
+Data flow: rectified pairs with ground truth -> shifts of both, at the size of row matching -> a table of
     how many pixels each matches, and how many of these are wrong, with the CPU seconds of one thread.
 """
 
@@ -19,15 +19,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geodiff_plugin.cameras import PosedViews
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.evaluation.datasets import StereoSample, find_pairs, load
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
-from geodiff_plugin.geometry import resize_image
 from geodiff_plugin.matching import match_volume, sweep_planes
 from geodiff_plugin.matching.census import grey
-from geodiff_plugin.matching.rows import RowPictures, grid_of_rows, match_rows, rectified_pictures
-from geodiff_plugin.types import CameraView, PosedViews
+from geodiff_plugin.matching.rows import RowImages, grid_of_rows, rectified_images
+from tests.tiny import rows_of
 
 __all__ = ["Score", "compare", "main"]
 
@@ -39,7 +39,7 @@ WRONG_PX = (1.0, 2.0)
 
 @dataclass(frozen=True)
 class Score:
-    """How well a matcher does: shares of pixels with truth, of those that it matches, and CPU seconds."""
+    """Accuracy of a matcher: fractions of pixels with ground truth, and of matched pixels; CPU seconds."""
 
     matched: float
     wrong: tuple[float, ...]  # of the matched ones, by ``WRONG_PX``
@@ -51,47 +51,45 @@ def _on_grid(sample: StereoSample) -> tuple[PosedViews, np.ndarray]:
     guidance = GeometryGuidance(sample.right, (sample.K_left, sample.K_right), sample.E)
     native = guidance.inputs[0].posed_views(left_images(sample.left)[0])
     size = grid_of_rows(native.size)
-    left_01, K = resize_image(native.left_01, native.K_left, size)
-    (view,) = native.views
-    right = CameraView(*resize_image(view.image_01, view.K, size), view.T_right_from_left)
+    resized = PosedViews(native.left.resized(size), tuple(view.resized(size) for view in native.rights))
     depth_m = np.where(sample.valid, sample.depth_m, 0.0).astype(np.float32)
     depth_m = cv2.resize(depth_m, size[::-1], interpolation=cv2.INTER_NEAREST)
-    return PosedViews(left_01, (right,), K), depth_m
+    return resized, depth_m
 
 
-def _by_opencv(pictures: RowPictures, views: PosedViews, nearest_px: float) -> tuple[Tensor, Tensor]:
-    found = match_rows(pictures, nearest_px)
+def _by_opencv(images: RowImages, views: PosedViews, nearest_px: float) -> tuple[Tensor, Tensor]:
+    found = rows_of(images, nearest_px)
     return found.shift, found.matched > 0
 
 
-def _by_aggregation(pictures: RowPictures, views: PosedViews, nearest_px: float) -> tuple[Tensor, Tensor]:
+def _by_aggregation(images: RowImages, views: PosedViews, nearest_px: float) -> tuple[Tensor, Tensor]:
     """Planes a pixel apart, from infinity to the nearest."""
-    per_px = 1.0 / pictures.shift_px(1.0)
+    per_px = 1.0 / images.shift_px(1.0)
     planes = torch.arange(int(nearest_px) + 5, dtype=torch.float32) * per_px
-    greys = [grey(image[None])[0] for image in (views.left_01, views.views[0].image_01)]
-    posed = PosedViews(greys[0], (views.views[0]._replace(image_01=greys[1]),), views.K_left)
-    matches = match_volume(sweep_planes(posed, planes))
+    pair = views.left, views.rights[0]
+    left, right = (view._replace(image_01=grey(view.image_01[None])[0]) for view in pair)
+    matches = match_volume(sweep_planes(PosedViews(left, (right,)), planes))
     return matches.inverse_depth[0] / per_px, matches.confidence[0] > SURE
 
 
 #: Name -> matcher: shifts ``(H, W)`` in pixels, and where they are known.
-MATCHERS: dict[str, Callable[[RowPictures, PosedViews, float], tuple[Tensor, Tensor]]] = {
+MATCHERS: dict[str, Callable[[RowImages, PosedViews, float], tuple[Tensor, Tensor]]] = {
     "OpenCV": _by_opencv,
     "aggregation": _by_aggregation,
 }
 
 
 def compare(sample: StereoSample) -> dict[str, Score]:
-    """The scores of both matchers on a rectified pair with truth."""
+    """The scores of both matchers on a rectified pair with ground truth."""
     views, depth_m = _on_grid(sample)
-    pictures = rectified_pictures(views)
-    assert pictures is not None
+    images = rectified_images(views)
+    assert images is not None
     known = depth_m > 0
-    true_px = np.where(known, pictures.shift_px(1.0) / np.where(known, depth_m, 1.0), 0.0)
+    true_px = np.where(known, images.shift_px(1.0) / np.where(known, depth_m, 1.0), 0.0)
     scores = {}
     for name, matcher in MATCHERS.items():
         started = time.process_time()
-        shift, matched = (each.numpy() for each in matcher(pictures, views, float(true_px.max())))
+        shift, matched = (each.numpy() for each in matcher(images, views, float(true_px.max())))
         seconds = time.process_time() - started
         off = np.abs(shift - true_px)[matched & known]
         wrong = tuple(float((off > most).mean()) for most in WRONG_PX)
@@ -102,7 +100,7 @@ def compare(sample: StereoSample) -> dict[str, Score]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table; ``--help`` lists the options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("data", type=Path, help="folder of data sets, as geodiff eval takes it")
+    parser.add_argument("data", type=Path, help="folder of data sets, as for geodiff eval")
     typed = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

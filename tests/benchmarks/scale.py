@@ -1,4 +1,4 @@
-"""What a million pairs take, as arithmetic: hours, terabytes, and cores that feed the cards.
+"""Estimate the cost of a million pairs: hours, terabytes, and CPU cores per GPU.
 
 Data flow: milliseconds of a guided call (given, from a table of ``tests.benchmarks.gpu``), bytes and CPU
     seconds of the demo pair (measured here) -> a table (``python -m tests.benchmarks.scale``).
@@ -21,9 +21,10 @@ from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.pair import run_pair
+from geodiff_plugin.jobs.pair import run_read_pair
 from geodiff_plugin.jobs.prior import prior_of_options
-from geodiff_plugin.jobs.rows import GuidedPair, ReadPair, read_columns, result_columns
+from geodiff_plugin.jobs.records import ReadPair
+from geodiff_plugin.jobs.rows import read_columns, result_columns
 from geodiff_plugin.jobs.writing import write_pair
 from geodiff_plugin.runtime.machine import pick_device
 
@@ -36,7 +37,7 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class Pair:
-    """What a pair takes beside its guided call.
+    """What a pair takes next to its guided call.
 
     Attributes:
         read_bytes: of its two image files.
@@ -63,16 +64,15 @@ def measure_pair() -> Pair:
     def read() -> ReadPair:
         return read_columns(options, row)
 
-    pair = read()
-    run = run_pair(prior_of_options(options, pick_device("cpu")), pair.options, pair.inputs, pair.log)
-    columns = result_columns(GuidedPair(run, {}))
+    run = run_read_pair(prior_of_options(options, pick_device("cpu")), read())
+    columns = result_columns(run)
     with tempfile.TemporaryDirectory() as folder, OutFolder(Path(folder) / "out", overwrite=True) as out:
         folder_seconds = _core_seconds(lambda: write_pair(out, run))
     return Pair(
         read_bytes=sum(path.stat().st_size for path in images.values()),
         written_bytes=len(columns["depth_mm"]) + len(columns["confidence"]),
         read_seconds=_core_seconds(read),
-        row_seconds=_core_seconds(lambda: result_columns(GuidedPair(run, {}))),
+        row_seconds=_core_seconds(lambda: result_columns(run)),
         folder_seconds=folder_seconds,
     )
 
@@ -90,16 +90,16 @@ def _core_seconds(work: Callable[[], Any]) -> float:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table; ``--help`` lists the options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--ms", type=float, required=True, help="milliseconds of a guided call on one card")
+    parser.add_argument("--ms", type=float, required=True, help="milliseconds of a guided call on one GPU")
     parser.add_argument("--pairs", type=int, default=1_000_000)
     parser.add_argument(
-        "--driver-bytes", type=int, default=0, help="of a listed pair (tests.benchmarks.many)"
+        "--driver-bytes", type=int, default=0, help="bytes per listed pair (from tests.benchmarks.many)"
     )
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     pair = measure_pair()
-    title = f"{options.pairs:,} pairs of the demo pair's size at {options.ms:g} ms a call, one worker a card"
-    headings = ("cards", "pairs a second", "hours", "MB a second read", "MB a second written", "cores busy")
+    title = f"{options.pairs:,} pairs of the demo pair's size, {options.ms:g} ms/call, one worker per GPU"
+    headings = ("GPUs", "pairs/s", "hours", "MB/s read", "MB/s written", "busy cores")
     table = new_table(headings, title)
     for cards in CARDS:
         rate = 1000 * cards / options.ms
@@ -113,11 +113,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"written {options.pairs * pair.written_bytes / 1e12:.2f} TB."
     )
     print(
-        f"CPU seconds of a pair: {pair.read_seconds:.3f} to read, {pair.row_seconds:.3f} to encode as a row, "
+        f"CPU seconds per pair: {pair.read_seconds:.3f} to read, {pair.row_seconds:.3f} to encode as a row, "
         f"{pair.folder_seconds:.3f} to write as a folder."
     )
     if options.driver_bytes:
-        print(f"The list of pairs takes {options.pairs * options.driver_bytes / 1e9:.1f} GB of the driver.")
+        print(f"The list of pairs takes {options.pairs * options.driver_bytes / 1e9:.1f} GB in the driver.")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What the maintainers' benchmarks count and fit."""
+"""Counts and fits of the benchmarks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from tests.benchmarks import calls, cost, gpu, large, many, maps, operations
@@ -25,7 +25,7 @@ def test_calls_of_every_way():
     assert made["plain"] == image | {"network": 3, "decode": 1}
     # Every correction decodes once and encodes twice, but for the last one, whose map is the result.
     assert made["guided"] == {"network": 3, "decode": 2, "encode": 3}
-    assert made["guided, every step corrected"] == {"network": 3, "decode": 3, "encode": 5}
+    assert made["guided, matches fitted at every step"] == {"network": 3, "decode": 3, "encode": 5}
     tiny = {"tiny decode": 1, "tiny encode": 2}
     assert made["guided, tiny decoder"] == image | {"network": 3, "decode": 1} | tiny
     assert made["Marigold-DC"] == image | {"network + back": 2, "decode + back": 2, "decode": 1}
@@ -54,18 +54,18 @@ def test_exponent_of_a_power():
     assert cost.exponent(values, [7.0] * 3) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_resized_pictures_keep_their_middle():
+def test_resized_images_keep_their_centre():
     left, _, cameras = cost.resized_pair(read_demo_pair(), 224)
     assert left.shape == (168, 224, 3)
     for K in cameras:
         np.testing.assert_allclose(K[:2, 2], (111.5, 83.5))
 
 
-def test_tables_stand_between_the_marks():
+def test_tables_are_between_the_markers():
     page = f"before\n{cost.BEGIN}\nold\n{cost.END}\nafter\n"
     assert cost.with_tables(page, "new") == f"before\n{cost.BEGIN}\n\nnew\n{cost.END}\nafter\n"
-    with pytest.raises(InputError, match="marks"):
-        cost.with_tables("no marks", "new")
+    with pytest.raises(InputError, match="markers"):
+        cost.with_tables("no markers", "new")
 
 
 def test_axes_that_are_not_measured_keep_their_tables(monkeypatch):
@@ -102,7 +102,7 @@ def test_many_pairs_one_after_the_other_and_overlapped(capsys):
     assert float(rows[0][-1]) == pytest.approx(both / one, abs=rounded)
 
 
-def test_many_pairs_say_what_broke(tmp_path):
+def test_many_pairs_report_what_failed(tmp_path):
     typed = many.write_pairs(tmp_path, 1, (64, 96))
     work = many.ManyPairs(typed)
     (tmp_path / "left" / "000000.png").write_bytes(b"")
@@ -111,7 +111,7 @@ def test_many_pairs_say_what_broke(tmp_path):
 
 
 def test_large_scene_is_nearer_at_the_bottom_and_behind_its_panel():
-    """As most pictures are; the other way round near and far look exchanged."""
+    """As most images are; the other way round near and far look swapped."""
     depth_m, panel = large.depth_strip((80, 60), range(60))
     wall = np.where(panel, np.nan, depth_m)
     assert np.nanmean(wall[-10:]) < np.nanmean(wall[:10])
@@ -133,7 +133,7 @@ def test_the_benchmark_of_a_gpu_runs_whole_at_a_tiny_size(tmp_path, capsys):
     parts = json.loads((tmp_path / "tables.json").read_text())["parts"]
     assert list(parts) == list(gpu.PARTS)
     assert all(part["rows"] and not any("failed" in row for row in part["rows"]) for part in parts.values())
-    ways = {row["way"]: row["ms"] for row in parts["full-size"]["rows"] if "way" in row}
+    ways = {row["call"]: row["ms"] for row in parts["full-size"]["rows"] if "call" in row}
     assert ways["guided"] > ways["plain"] > 0.0
     spent = {row["stage"].strip(): row["ms"] for row in parts["stages"]["rows"]}
     assert 0.0 < spent["refine_to_matches"] < spent["Trajectory.find_scale"]
@@ -141,7 +141,7 @@ def test_the_benchmark_of_a_gpu_runs_whole_at_a_tiny_size(tmp_path, capsys):
     assert all(f"\n{name}: " in printed for name in gpu.PARTS)
 
 
-def test_a_part_that_fails_says_why_and_the_next_one_runs(tmp_path, monkeypatch, capsys):
+def test_a_failed_part_states_the_reason_and_the_next_one_runs(tmp_path, monkeypatch, capsys):
     def broken(bench):
         yield {"row": "before the error"}
         raise ValueError("the card caught fire")
@@ -150,4 +150,4 @@ def test_a_part_that_fails_says_why_and_the_next_one_runs(tmp_path, monkeypatch,
     assert gpu.main(["--smoke", "--json", str(tmp_path / "tables.json")]) == 1
     out = capsys.readouterr().out
     assert "before the error" in out and "ValueError: the card caught fire" in out
-    assert "only CUDA is waited for" in out
+    assert "the host waits only for CUDA" in out

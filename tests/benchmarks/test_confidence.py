@@ -1,8 +1,7 @@
-"""Refitting what is promised: known coefficients come back, signs hold, and the other half judges."""
+"""Fitting confidence: known coefficients are recovered, signs hold, and the other half is evaluated."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +11,12 @@ import pytest
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from tests.benchmarks.confidence import (
     TEXTURES,
+    ConfidenceOptions,
     Observed,
     Wall,
     by_texture,
     calibrate,
+    coverage_of_sigma,
     deciles,
     fit_log_odds,
     main,
@@ -23,8 +24,11 @@ from tests.benchmarks.confidence import (
     of_walls,
     off_plane,
     promised,
+    risk_by_coverage,
     texture_of,
 )
+
+pytestmark = pytest.mark.end_to_end
 
 TRUE = (-0.5, 1.2, -0.7)
 
@@ -70,18 +74,18 @@ def test_the_half_that_was_not_fitted_on_judges():
         judged = np.concatenate(calibrate(pairs, (0, 0, 0))[2])
         right = np.concatenate([pair.right for pair in pairs])
         found = deciles(judged, right, np.ones(len(right)))
-        return max(abs(d.promised - d.kept) for d in found if d.share > 0.02)
+        return max(abs(d.promised - d.kept) for d in found if d.fraction > 0.02)
 
     assert gap(honest) < 0.05 and gap(lying) > 0.5
 
 
 def test_deciles_of_a_promise_that_is_kept_by_half():
     found = deciles(np.array([0.05, 0.95, 0.95, 1.0]), np.array([0, 1, 0, 1]), np.array([1.0, 1.0, 1.0, 2.0]))
-    assert [round(d.share, 2) for d in found] == [0.2, 0.8]
+    assert [round(d.fraction, 2) for d in found] == [0.2, 0.8]
     assert found[1].kept == pytest.approx(0.75) and found[1].promised == pytest.approx(0.975)
 
 
-def test_classes_of_texture_are_counted_apart():
+def test_classes_of_texture_are_counted_separately():
     """A blank half that is right in 1 of 2 and a textured one in 3 of 4; only one of each is called sure."""
     right = np.array([1, 0, 1, 1, 0, 1], bool)
     stated = np.array([0.95, 0.4, 0.9, 0.5, 0.5, 0.1])
@@ -92,23 +96,60 @@ def test_classes_of_texture_are_counted_apart():
     np.testing.assert_allclose(rows[-1], (4 / 6, 0.75, 0.5, 0.25, 1.0))
 
 
-def test_walls_that_are_off_are_counted_apart():
+def test_walls_that_are_off_are_counted_separately():
     """Of four pixels one is off by 6 %, of two of a second pair one by 20 %; every pair weighs the same."""
-    one = Wall(np.array([0.0, 0.01, 0.06, 0.04]), np.array([0.9, 0.8, 0.5, 0.4]))
-    other = Wall(np.array([0.2, 0.0]), np.array([0.3, 0.6]))
+    one = Wall(
+        np.array([0.0, 0.01, 0.06, 0.04]), np.array([0.9, 0.8, 0.5, 0.4]), np.array([0.01, 0.02, 0.3, 0.04])
+    )
+    other = Wall(np.array([0.2, 0.0]), np.array([0.3, 0.6]), np.array([0.1, 0.05]))
     row = of_walls([one, other])
     np.testing.assert_allclose(row.off, (1 / 4 + 1 / 2) / 2)
     np.testing.assert_allclose(row.within, (1 / 4) / (1 / 4 + 1 / 2))
     np.testing.assert_allclose(row.of_off, (0.5 / 4 + 0.3 / 2) / (3 / 4))
     np.testing.assert_allclose(row.of_right, ((0.9 + 0.8 + 0.4) / 4 + 0.6 / 2) / (5 / 4))
-    np.testing.assert_allclose(row.told_apart, 7 / 8)  # of eight pairs, .4 is below .5 alone
-    # A normal error of this size is within 10 % with the median confidence.
-    for spread, stated in ((row.spread_off, 0.4), (row.spread_right, 0.7)):
-        np.testing.assert_allclose(math.erf(0.1 / spread / math.sqrt(2.0)), stated, rtol=1e-6)
-    assert of_walls([Wall(np.zeros(3), np.ones(3))])[0] == 0.0
+    np.testing.assert_allclose(row.auroc, 7 / 8)  # of eight pairs, .4 is below .5 alone
+    np.testing.assert_allclose((row.spread_off, row.spread_right), (0.2, 0.03))
+    assert of_walls([Wall(np.zeros(3), np.ones(3), np.ones(3))])[0] == 0.0
 
 
-def test_planes_of_truth_are_found_and_their_edges_are_none():
+def test_coverage_of_normal_errors_is_that_of_their_intervals_by_texture_and_pairs_weigh_the_same():
+    rng, pairs = np.random.default_rng(0), []
+    for count, factor in ((30_000, 1.0), (10_000, 2.0)):  # the second pair understates its errors by half
+        texture = np.where(np.arange(count) % 2 == 0, 0.001, 0.5)
+        deviation = np.abs(rng.normal(size=count)) * np.where(texture > 0.1, factor, 1.0)
+        blank = np.zeros(count)
+        sigma = np.where(texture > 0.1, 0.02, 0.05)
+        pairs.append(Observed(np.ones((count, 1)), blank > 1, blank, texture, blank, blank, sigma, deviation))
+    rows = coverage_of_sigma(pairs)
+    assert len(rows) == len(TEXTURES) + 2
+    plain, textured, every = rows[0], rows[-2], rows[-1]
+    assert rows[1].fraction == 0 and np.isnan(rows[1].within).all()
+    np.testing.assert_allclose(plain.within, (0.683, 0.95), atol=0.006)
+    np.testing.assert_allclose(textured.within, ((0.683 + 0.383) / 2, (0.95 + 0.673) / 2), atol=0.008)
+    np.testing.assert_allclose(every.within, np.mean([plain.within, textured.within], 0), atol=1e-9)
+    assert (plain.sigma, textured.sigma, every.fraction) == (0.05, 0.02, 1.0)
+
+
+def test_risk_by_coverage_sorts_each_pair_by_itself():
+    errors = np.array([0.4, 0.1, 0.3, 0.2]), np.array([0.0, 0.8, 0.4, 0.4])
+    stated = np.array([0.1, 0.9, 0.3, 0.8]), np.array([0.2, 0.9, 0.5, 0.5])  # perfect, and the worst order
+    pairs = [
+        Observed(np.ones((4, 1)), error < 0.1, sure, np.zeros(4), error, np.zeros(4), -sure, error)
+        for error, sure in zip(errors, stated, strict=True)
+    ]
+    rows = risk_by_coverage(pairs)
+    assert list(rows) == ["confidence", "sigma", "random", "error"]
+    assert rows["confidence"] == rows["sigma"] and rows["error"].ause == 0.0
+    # All, (0.9: four of four,) three, two and one of the pixels of both pairs.
+    np.testing.assert_allclose(
+        rows["error"].risk, np.add((0.25, 0.25, 0.2, 0.15, 0.1), (0.4, 0.4, 4 / 15, 0.2, 0)) / 2
+    )
+    np.testing.assert_allclose(rows["confidence"].risk[-1], (0.1 + 0.8) / 2)
+    assert rows["confidence"].ause > rows["random"].ause * 0.5 > 0
+    assert len(set(rows["random"].risk)) == 1
+
+
+def test_planes_of_ground_truth_are_found_without_their_edges():
     row, column = np.mgrid[:80, :120]
     depth_m = 1.0 / (0.2 + 0.001 * row + 0.0005 * column)
     depth_m[:, 70:] *= 1.3
@@ -129,27 +170,28 @@ def test_texture_is_the_mean_step_of_brightness_along_rows():
 
 @pytest.mark.slow
 def test_the_command_prints_constants_that_can_be_pasted(capsys):
-    main(data=["synthetic:2@160x120"], resolution=64)
+    main(ConfidenceOptions(data=("synthetic:2@160x120",), resolution=64))
     printed, names = capsys.readouterr().out, {}
     for line in printed.splitlines():
-        if line.startswith(("LOG_ODDS", "BY_EVIDENCE")):
+        if line.startswith(("LOG_ODDS", "DEPTH_LOG_ODDS")):
             exec(line, names)  # as pasted
-    assert len(names["LOG_ODDS"]) == 4 and len(names["BY_EVIDENCE"]) == 6
-    assert names["BY_EVIDENCE"][-1] == -15.0  # one member has no spread: the shipped number stays
-    assert "largest gap between promised and kept" in printed and "plain walls" in printed
+    assert len(names["LOG_ODDS"]) == 4 and len(names["DEPTH_LOG_ODDS"]) == 6
+    assert names["DEPTH_LOG_ODDS"][-1] == -15.0  # one member has no spread: the shipped number stays
+    assert "largest gap between predicted and observed" in printed and "plain walls" in printed
+    assert "coverage of sigma" in printed and "risk and coverage" in printed
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         ({"what": "deep"}, "what must be one of"),
-        ({"strengths": "5%, 7%"}, "strengths must be one of"),
-        ({"data": ["synthetic:1@64x48"], "what": "matches"}, "at least two pairs with truth; got 1"),
+        ({"strengths": ("5%", "7%")}, "strengths must be one of"),
+        ({"data": ("synthetic:1@64x48",), "what": "matches"}, "at least two pairs with truth; got 1"),
     ],
 )
 def test_options_that_would_fit_nothing_are_named(options, said):
     with pytest.raises(ValueError, match=said):
-        main(**{"data": ["synthetic:2@64x48"]} | options)
+        main(ConfidenceOptions(**{"data": ("synthetic:2@64x48",)} | options))
 
 
 def test_emulated_priors_of_a_pair_are_observed_one_by_one():

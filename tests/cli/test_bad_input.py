@@ -1,6 +1,6 @@
 """Every kind of bad input ends in one line, the one in ``bad_input.txt``; nothing loads or is written.
 
-That table has a command, in a folder with the files below, and indented what it says. After a message was
+That table has a command, in a folder with the files below, and its message, indented. After a message was
 changed on purpose: ``GEODIFF_WRITE=1 pytest tests/cli/test_bad_input.py``, and read what differs.
 """
 
@@ -15,8 +15,9 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin.cli.app import COMMANDS
-from geodiff_plugin.formats.reading import CALIBRATION_FORMATS
-from geodiff_plugin.options import DTYPES, PRESETS, SPACES, rules_of
+from geodiff_plugin.formats import CALIBRATION_FORMATS
+from geodiff_plugin.options import DTYPES, PRESETS, SPACES
+from geodiff_plugin.settings import settings_of
 from tests.cli.conftest import never
 
 TABLE = Path(__file__).with_name("bad_input.txt")
@@ -50,7 +51,7 @@ FILES: dict[str, Any] = dict.fromkeys(EMPTY, "") | {
     "E-still.txt": np.eye(4),
     "large.json": NERF.replace("64", "128").replace("48", "96"),
     "walk.json": NERF,
-    # photographs
+    # images
     "cut.png": lambda path: path.write_bytes(Path("left.png").read_bytes()[:1000]),
     "small.png": Image.new("RGB", (64, 31)).save,
     "third.png": Image.new("RGB", (64, 48)).save,
@@ -99,12 +100,12 @@ def write_files() -> None:
 WITHOUT_TORCH = """
 import sys
 
-class Refuse:
+class Reject:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in ("torch", "diffusers", "transformers", "kornia"):
             raise SystemExit("imported " + name)
 
-sys.meta_path.insert(0, Refuse())
+sys.meta_path.insert(0, Reject())
 from geodiff_plugin.cli.app import main
 
 def run(words):
@@ -137,7 +138,7 @@ def test_bad_input(typed, geodiff, pair_files, monkeypatch):
     assert message == MESSAGES[typed]
 
 
-def test_what_needs_no_torch_is_said_without_it(pair_files):
+def test_errors_that_need_no_torch_are_raised_without_it(pair_files):
     """In one process: options, files, the folder; and that good ones do import it."""
     write_files()
     Path("geodiff-out").mkdir()
@@ -167,8 +168,7 @@ def test_names_that_are_known_without_torch_are_those_with_it():
 
     assert set(SPACES) == set(space.SPACES) and set(PRESETS) <= set(CONFIGS)
     assert all(isinstance(getattr(torch, name), torch.dtype) for name in DTYPES)
-    submit = COMMANDS["submit"][0].__dataclass_fields__["to"]
-    assert set(rules_of(submit).choices) == set(BENCHMARKS)
+    assert set(settings_of(COMMANDS["submit"].options)["to"].choices) == set(BENCHMARKS)
 
 
 def test_help_imports_neither_torch_nor_numpy():

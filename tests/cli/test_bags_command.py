@@ -10,9 +10,11 @@ import pytest
 pytest.importorskip("rosbags")
 from rosbags.highlevel import AnyReader
 
-from tests.unit import test_bags as bags
+from tests.unit.formats import bags
 
-TOPICS = ("--left", bags.TOPICS[0], "--right", bags.TOPICS[1])
+pytestmark = pytest.mark.end_to_end
+
+TOPICS = ("--left-topic", bags.TOPICS[0], "--right-topic", bags.TOPICS[1])
 
 
 def depth_images(path: Path) -> list[tuple[int, np.ndarray]]:
@@ -69,5 +71,19 @@ def test_submissions_are_what_the_benchmarks_read(geodiff, prior, pair_files) ->
         assert float(words[-1]) > 0 and words[:-1] == ["runtime"] * (benchmark == "eth3d")
     shutil.copytree("result", "again")
     answer = geodiff("submit", "result", "again", "--to", "eth3d", "--out", "twice")
-    assert answer.code == 2 and "result and again are both of the scene" in answer.err
+    assert answer.code == 2 and "result and again are both results of scene" in answer.err
     assert not Path("twice").exists()
+
+
+def test_masked_pixels_of_a_bag_have_no_depth(geodiff, prior, textured_plane, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(bags, "K", textured_plane.K)
+    bags.write_bag(tmp_path / "drive.mcap", images=(textured_plane.left, textured_plane.right))
+    height, width = textured_plane.left.shape[:2]
+    valid = np.arange(width)[None].repeat(height, 0) < width // 2
+    cv2.imwrite("mask.png", valid * np.uint8(255))
+    words = ["depth", "drive.mcap", *TOPICS, "--prior", prior, "--steps", "2", "-q", "--mask", "mask.png"]
+    answer = geodiff(*words, "--out", "depth.mcap")
+    assert answer.code == 0, answer.err
+    for _, image in depth_images(Path("depth.mcap")):
+        assert not image[~valid].any() and (image[valid] > 0).mean() > 0.9

@@ -12,17 +12,20 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 pytest.importorskip("pycolmap")
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.formats.out import FOLDER_LOCK, PARTIAL, working_in
-from geodiff_plugin.jobs.capture import JOURNAL
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.formats.out import FOLDER_LOCK, PARTIAL, locked_folder
+from geodiff_plugin.jobs.capture_frames import JOURNAL
 from geodiff_plugin.jobs.memory import fitting_memory
-from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
+from geodiff_plugin.result.expected_error import MATCH_NOISE_PX, expected_error
 from tests.cli.conftest import call
 from tests.unit.capture_room import render, walk, write_transforms
+
+pytestmark = pytest.mark.end_to_end
 
 TRUE = walk(10)[3:7]
 QUICK = ["--steps", 1, "--neighbours", 1, "--processes", 1, "--device", "cpu", "-q"]
@@ -30,7 +33,7 @@ QUICK = ["--steps", 1, "--neighbours", 1, "--processes", 1, "--device", "cpu", "
 
 @pytest.fixture(autouse=True)
 def few_features(monkeypatch):
-    monkeypatch.setattr("geodiff_plugin.pose.reconstruction.MOST_FEATURES", 450)
+    monkeypatch.setattr("geodiff_plugin.pose.reconstruction.MAX_FEATURES", 450)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +72,7 @@ def test_the_same_run_again_keeps_what_is_there_also_in_another_place(scan, geod
     assert not (scan / "out" / FOLDER_LOCK).exists()
 
 
-def test_other_settings_are_refused_with_the_difference_and_overwrite_makes_all_anew(scan, geodiff):
+def test_other_settings_are_rejected_with_the_difference_and_overwrite_recomputes_all(scan, geodiff):
     (scan / "out/f01/notes.txt").write_text("mine")
     first, summary = depth_of(scan), (scan / "out/capture.json").read_bytes()
     answer = geodiff(*typed(scan, "--metres-per-unit", 2))
@@ -113,14 +116,14 @@ def lost_frame(folder):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (changed_camera, "the camera of f00, f01, f02, ... changed"),
-        (moved_poses, "the camera of f00, f01, f02, ... changed"),
+        (changed_camera, "the camera of f00, f01, f02, f03 changed"),
+        (moved_poses, "the camera of f00, f01, f02, f03 changed"),
         (other_image, "the image of f02 changed"),
         (other_map, "the prior map of f01 changed"),
         (lost_frame, "made of 4 frames instead of 3"),
     ],
 )
-def test_changed_inputs_are_refused_and_named(change, words, scan, geodiff):
+def test_changed_inputs_are_rejected_and_named(change, words, scan, geodiff):
     first, poses = depth_of(scan), (scan / "out/poses.npz").read_bytes()
     change(scan)
     for more in [()] if change is other_map else [(), ("--poses-only",)]:
@@ -133,16 +136,16 @@ def test_a_frame_of_another_run_does_not_count_as_done(scan, geodiff):
     path = scan / "out/f01/report.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"made_from": "of another"}))
     answer = geodiff(*typed(scan))
-    assert answer.code == 2 and "f01 has other settings or inputs" in answer.err
+    assert answer.code == 2 and "with other settings or inputs of f01" in answer.err
 
 
-def test_runs_at_the_same_time_in_one_folder_are_refused_but_shards_share_it(scan, geodiff):
+def test_runs_at_the_same_time_in_one_folder_are_rejected_but_shards_share_it(scan, geodiff):
     whole, shard = typed(scan), typed(scan, "--shard", "0/2")
-    with working_in(scan / "out"):
+    with locked_folder(scan / "out"):
         for each in (whole, shard):
             answer = geodiff(*each)
-            assert answer.code == 2 and "a folder that no other run has" in answer.err
-    with working_in(scan / "out", shared=True):
+            assert answer.code == 2 and "a folder that no other run uses" in answer.err
+    with locked_folder(scan / "out", shared=True):
         assert geodiff(*whole).code == 2
         assert geodiff(*shard).code == 0
     assert not (scan / "out" / FOLDER_LOCK).exists()
@@ -174,7 +177,7 @@ def test_asked_to_end_it_clears_away_what_it_began(finished, tmp_path):
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=300)
     assert process.returncode == 143
-    assert "geodiff: terminated; the same command resumes" in said and "Traceback" not in said
+    assert "geodiff: terminated. Run the same command again to resume." in said and "Traceback" not in said
     left = [path.name for path in out.rglob("*") if PARTIAL in path.name or path.name == FOLDER_LOCK]
     assert not left
 
@@ -182,7 +185,7 @@ def test_asked_to_end_it_clears_away_what_it_began(finished, tmp_path):
 WITHOUT_GUARD = """
 import sys
 from geodiff_plugin.cli.app import main
-from geodiff_plugin.jobs.separate import SeparateProcess
+from geodiff_plugin.jobs.processes import WorkerProcess
 
 def call(process, *args):
     if KILLS:
@@ -191,7 +194,7 @@ def call(process, *args):
     print("another process made", record["frame"])
     return record
 
-called, SeparateProcess.call = SeparateProcess.call, call
+called, WorkerProcess.call = WorkerProcess.call, call
 print("the script runs")
 main(sys.argv[1:])
 """
@@ -208,7 +211,7 @@ def test_a_script_without_guard_has_frames_by_several_processes(kills, finished,
     lines = ran.stdout.splitlines()
     assert lines.count("the script runs") == 1 and any(line.startswith("2 of 2 frames") for line in lines)
     assert any(line.startswith("another process made f0") for line in lines) == (not kills)
-    assert ("is made anew: A helper process has ended" in ran.stderr) == kills
+    assert ("is being reprocessed: A worker process ended" in ran.stderr) == kills
     assert [path.name for path in (tmp_path / "out").glob("frames*")] == [JOURNAL]
     same = (folder / "f01/depth_alone.npy" for folder in (finished / "out", tmp_path / "out"))
     assert len({path.read_bytes() for path in same}) == 1
@@ -222,7 +225,7 @@ def test_what_does_not_fit_the_memory_is_one_sentence_with_its_size(ask, command
     monkeypatch.setattr("geodiff_plugin.jobs.writing.build_report", lambda _: ask())
     answer = geodiff(*command, "--steps", 1, "--preset", "paper", "--out", "o", "-q")
     assert answer.code == 2 and "Traceback" not in answer.err
-    assert "of 64x48 pixels (0.0 megapixels) does not fit the memory. Make the pictures smaller" in answer.err
+    assert "of 64x48 pixels (0.0 megapixels) does not fit in memory. Downscale the images" in answer.err
 
 
 def test_other_errors_are_left_as_they_are():
@@ -232,7 +235,7 @@ def test_other_errors_are_left_as_they_are():
         raise InputError("bad name: out of memory.png")
 
 
-def test_the_expected_error_of_a_large_picture_needs_little_beside_itself():
+def test_the_expected_error_of_a_large_image_needs_little_additional_memory():
     depth_m = np.full((3000, 4000), 2.0, np.float32)
     E = np.eye(4)
     E[:3, 3] = 0.1, 0.02, 0.05
@@ -290,3 +293,36 @@ def test_a_killed_capture_resumes_to_the_same_bytes(tmp_path):
     for file in [*files, "cloud.ply"]:
         assert (whole / file).read_bytes() == (killed / file).read_bytes()
     assert not list(killed.rglob(f"*{PARTIAL}"))
+
+
+def test_masked_pixels_get_no_depth_and_no_points_and_another_mask_is_another_run(scan, geodiff, tmp_path):
+    valid = np.arange(240)[None].repeat(180, 0) < 150
+    (scan / "scan/masks").mkdir()
+    for number in range(len(TRUE)):
+        Image.fromarray(np.uint8(255) * valid).save(scan / f"scan/masks/f{number:02d}.png.png")
+    answer = geodiff(*typed(scan))
+    assert answer.code == 2 and "the mask of f00, f01, f02, f03 changed" in answer.err
+    answer = geodiff(*typed(scan, "--overwrite", "--frames", "f01,f02", "--export", "nerfstudio"))
+    assert answer.code in (0, 4), answer.err
+    findings = json.loads((scan / "out/capture.json").read_text())["findings"]
+    assert "4 of 4 frames have a mask in the capture" in str(findings)
+    for name in ("f01", "f02"):
+        depth, confidence = (np.load(scan / f"out/{name}/{file}.npy") for file in ("depth", "confidence"))
+        assert (depth[~valid] == 0).all() and (confidence[~valid] == 0).all() and (depth[valid] > 0).all()
+        assert not np.asarray(Image.open(scan / f"out/{name}/depth_mm.png"))[~valid].any()
+    cloud = trimesh.load(scan / "out/cloud.ply").vertices
+    camera = json.loads((scan / "out/f01/report.json").read_text())
+    E, (fx, _, cx) = np.array(camera["T_world_from_camera"]), camera["K"][0]
+    seen = (cloud - E[:3, 3]) @ E[:3, :3]
+    column = fx * seen[:, 0] / seen[:, 2] + cx
+    assert len(cloud) > 100 and np.mean(column < 155) > 0.95  # the other frame sees a little further
+    splats = json.loads((scan / "out/nerfstudio/transforms.json").read_text())
+    assert [frame["mask_path"] for frame in splats["frames"]] == ["masks/f01.png", "masks/f02.png"]
+    white = tmp_path / "white.png"
+    Image.new("L", (240, 180), 255).save(white)
+    answer = geodiff(*typed(scan, "--mask", white))
+    assert answer.code == 2 and "the mask of f00, f01, f02, f03 changed" in answer.err
+    answer = geodiff(*typed(scan, "--mask", tmp_path))
+    assert answer.code == 2 and "without masks for f00, f01, f02, f03" in answer.err
+    answer = geodiff(*typed(scan, "--mask", white, "--overwrite"))
+    assert answer.code in (0, 4) and (np.load(scan / "out/f01/depth.npy") > 0).all()

@@ -75,7 +75,7 @@ class Foreign:
     [
         ("weights", ("missing: mid_block.attentions.0.proj_in.weight", "label_emb.weight", "in_layers.1")),
         ({f"layer{i}.weight": torch.zeros(1) for i in range(10)}, ("layer0.weight", "layer7.weight")),
-        ([1, 2], ("holds a mapping", "list")),
+        ([1, 2], ("with a mapping", "list")),
         ({"state_dict": Foreign(), "empty_text_embedding": np.zeros(1)}, ("never done",)),
     ],
 )
@@ -193,7 +193,7 @@ def test_what_is_missing_or_does_not_fit_v2_is_named(convert_v2, assets):
     refused(convert_v2(checkpoint="V2/depth/nothing"), assets, KEPT, "CHECKPOINT", "trainables.safetensors")
 
 
-def test_prompts_of_v2_are_looked_for_beside_the_checkpoint_or_named(convert_v2, assets):
+def test_prompts_of_v2_are_looked_up_next_to_the_checkpoint_or_given(convert_v2, assets):
     (assets / "V2" / "qwen_text_embeddings").rename(assets / "elsewhere")
     refused(convert_v2(), assets, KEPT, "--with", "qwen_text_embeddings")
     assert convert_v2("--with", assets / "elsewhere").code == 0

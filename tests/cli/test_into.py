@@ -1,4 +1,4 @@
-"""``geodiff depth --into camera.json``: depth as another camera sees it, in files, folders and bags."""
+"""``geodiff depth --reproject camera.json``: depth as another camera sees it, in files, folders and bags."""
 
 import json
 
@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
+from geodiff_plugin._internal.reprojection import depth_in_camera
+from geodiff_plugin.cameras import Camera, PosedCamera
 from tests.cli.conftest import QUICK, report_of
+
+pytestmark = pytest.mark.end_to_end
 
 K_TO = [[70.0, 0, 40.0], [0, 70.0, 28.0], [0, 0, 1]]
 E_TO = [[1.0, 0, 0, 0.02], [0, 1, 0, -0.01], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -23,39 +26,49 @@ def camera_file(folder, **changed):
 
 def expected_of(folder):
     depth_m, K = np.load(folder / "depth.npy"), np.reshape(report_of(folder)["K"], (3, 3))
-    return depth_in_camera(depth_m, K, PosedCamera(np.array(K_TO), np.array(E_TO), (80, 56)))
+    return depth_in_camera(depth_m, Camera(K), PosedCamera(np.array(K_TO), (80, 56), E=np.array(E_TO)))
 
 
 def check(folder):
-    seen_m = np.load(folder / "depth_into.npy")
+    seen_m = np.load(folder / "depth_reprojected.npy")
     np.testing.assert_array_equal(seen_m, expected_of(folder))
-    whole = np.asarray(Image.open(folder / "depth_into_mm.png"))
+    whole = np.asarray(Image.open(folder / "depth_reprojected_mm.png"))
     assert whole.dtype == np.uint16 and whole.shape == (56, 80)
     np.testing.assert_allclose(whole / 1000, np.where(seen_m < 65.5, seen_m, 0), atol=6e-4)
-    share = report_of(folder)["into"]["known_share"]
-    assert share > 0.3 and share == pytest.approx((seen_m > 0).mean(), abs=1e-4)
+    fraction = report_of(folder)["reproject"]["known_fraction"]
+    assert fraction > 0.3 and fraction == pytest.approx((seen_m > 0).mean(), abs=1e-4)
 
 
 def test_a_pair_is_written_as_the_other_camera_sees_it(pair_files, geodiff, tmp_path):
-    words = [*pair_files.command, *QUICK, "--into", camera_file(tmp_path), "--out", "o", "-q"]
+    words = [*pair_files.command, *QUICK, "--reproject", camera_file(tmp_path), "--out", "o", "-q"]
     answer = geodiff(*words)
     assert answer.code == 0, answer.err
     check(tmp_path / "o")
-    assert "depth_into_mm.png" in report_of(tmp_path / "o")["files"]["names"]
+    assert "depth_reprojected_mm.png" in report_of(tmp_path / "o")["files"]["names"]
 
 
-def test_so_are_many_pairs_and_their_steady_depth(pair_files, geodiff, tmp_path):
+def test_many_pairs_and_their_smoothed_depth_are_reprojected(pair_files, geodiff, tmp_path):
     for name, file in (("l", pair_files.left), ("r", pair_files.right)):
         (tmp_path / name).mkdir()
         for number in range(2):
             Image.open(file).save(tmp_path / name / f"{number}.png")
-    words = ["depth", "l", "r", "--calib", pair_files.calib, *QUICK, "--into", camera_file(tmp_path), "-q"]
-    answer = geodiff(*words, "--out", "o", "--steady")
+    words = [
+        "depth",
+        "l",
+        "r",
+        "--calib",
+        pair_files.calib,
+        *QUICK,
+        "--reproject",
+        camera_file(tmp_path),
+        "-q",
+    ]
+    answer = geodiff(*words, "--out", "o", "--temporal-smoothing")
     assert answer.code == 0, answer.err
     for number in range(2):
         check(tmp_path / "o" / str(number))
     camera_file(tmp_path, width=81)
-    answer = geodiff(*words, "--out", "o", "--steady")
+    answer = geodiff(*words, "--out", "o", "--temporal-smoothing")
     assert answer.code == 2 and "camera.json changed" in answer.err
 
 
@@ -63,14 +76,14 @@ def test_a_bag_has_the_depth_and_the_camera_of_that_camera(geodiff, textured_pla
     pytest.importorskip("rosbags")
     from rosbags.highlevel import AnyReader
 
-    from tests.unit import test_bags as bags
+    from tests.unit.formats import bags
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(bags, "K", textured_plane.K)
     bags.write_bag(tmp_path / "drive.mcap", images=(textured_plane.left, textured_plane.right))
-    topics = ("--left", bags.TOPICS[0], "--right", bags.TOPICS[1])
+    topics = ("--left-topic", bags.TOPICS[0], "--right-topic", bags.TOPICS[1])
     answer = geodiff(
-        "depth", "drive.mcap", *topics, *QUICK, "--into", camera_file(tmp_path), "-q", "--out", "d.mcap"
+        "depth", "drive.mcap", *topics, *QUICK, "--reproject", camera_file(tmp_path), "-q", "--out", "d.mcap"
     )
     assert answer.code == 0, answer.err
     with AnyReader([tmp_path / "d.mcap"]) as reader:
@@ -88,13 +101,13 @@ def test_a_bag_has_the_depth_and_the_camera_of_that_camera(geodiff, textured_pla
     [
         ({"E": None}, "without E"),
         ({"width": None, "height": None}, "without width, height"),
-        ({"width": "wide"}, "--into: size must be an integer"),
-        ({"K": [[1, 2], [3, 4]]}, "--into: K must be a 3x3 matrix"),
-        ({"E": [[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}, "--into: E must be rigid"),
+        ({"width": "wide"}, "--reproject: size must be an integer"),
+        ({"K": [[1, 2], [3, 4]]}, "--reproject: K must be a 3x3 matrix"),
+        ({"E": [[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}, "--reproject: E must be rigid"),
     ],
 )
-def test_a_camera_file_that_is_none_is_refused_before_any_work(changed, words, pair_files, geodiff, tmp_path):
-    answer = geodiff(*pair_files.command, "--into", camera_file(tmp_path, **changed), "--out", "o", "-q")
+def test_an_invalid_camera_file_is_rejected_before_any_work(changed, words, pair_files, geodiff, tmp_path):
+    answer = geodiff(*pair_files.command, "--reproject", camera_file(tmp_path, **changed), "--out", "o", "-q")
     assert answer.code == 2 and words in answer.err and not (tmp_path / "o").exists()
 
 
@@ -103,16 +116,16 @@ def test_a_camera_file_that_is_none_is_refused_before_any_work(changed, words, p
 )
 def test_damaged_camera_files_are_a_sentence(text, pair_files, geodiff, tmp_path):
     (tmp_path / "camera.json").write_text(text)
-    answer = geodiff(*pair_files.command, "--into", tmp_path / "camera.json", "--out", "o", "-q")
-    assert answer.code == 2 and answer.err.startswith("geodiff: --into")
+    answer = geodiff(*pair_files.command, "--reproject", tmp_path / "camera.json", "--out", "o", "-q")
+    assert answer.code == 2 and answer.err.startswith("geodiff: --reproject")
 
 
-def test_it_is_where_opencv_says(pair_files, geodiff, tmp_path):
+def test_it_is_where_opencv_puts_it(pair_files, geodiff, tmp_path):
     """A pixel of the left image lands where ``cv2.projectPoints`` puts its point, at that depth."""
-    words = [*pair_files.command, *QUICK, "--into", camera_file(tmp_path), "--out", "o", "-q"]
+    words = [*pair_files.command, *QUICK, "--reproject", camera_file(tmp_path), "--out", "o", "-q"]
     assert geodiff(*words).code == 0
     depth_m, K = np.load("o/depth.npy"), np.reshape(report_of("o")["K"], (3, 3))
-    seen_m = np.load("o/depth_into.npy")
+    seen_m = np.load("o/depth_reprojected.npy")
     row, column = 24, 30
     point = np.linalg.inv(K) @ [column, row, 1] * depth_m[row, column] - np.array(E_TO)[:3, 3]
     (u, v) = cv2.projectPoints(point[None], np.zeros(3), np.zeros(3), np.array(K_TO), None)[0][0, 0]

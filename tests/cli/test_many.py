@@ -21,6 +21,8 @@ from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import find_pairs
 from tests.cli.conftest import QUICK, call, never, report_of, write_pair
 
+pytestmark = pytest.mark.end_to_end
+
 COMMAND = ["depth", "left", "right", "--calib", "calib.txt", "--prior", "prior", "--out", "out", *QUICK]
 DEPTHS = [Path("out", name, "depth.npy") for name in "abc"]
 
@@ -79,16 +81,16 @@ def contents(folder: Path) -> dict[Path, bytes]:
 def test_folders_go_by_name_else_by_order_in_which_numbers_count(tmp_path, textured_plane):
     write_folders(tmp_path, textured_plane, ["f10", "f1", "f2"])
     left, right = tmp_path / "left", tmp_path / "right"
-    (left / "notes.md").write_text("no picture")
+    (left / "notes.md").write_text("no image")
     options = DepthOptions(left=left, right=right)
-    told = []
-    assert [ref.name for ref in find_pairs(options, told.append)] == ["f1", "f2", "f10"]
-    assert told == []
+    reported = []
+    assert [ref.name for ref in find_pairs(options, reported.append)] == ["f1", "f2", "f10"]
+    assert reported == []
     for path in right.iterdir():
         path.rename(path.with_stem(f"{path.stem}_R"))
-    names = [ref.right.name for ref in find_pairs(options, told.append)]
+    names = [ref.right.name for ref in find_pairs(options, reported.append)]
     assert names == ["f1_R.png", "f2_R.png", "f10_R.png"]
-    assert "in order: f1.png with f1_R.png to f10.png with f10_R.png." in told[0]
+    assert "in order: f1.png with f1_R.png to f10.png with f10_R.png." in reported[0]
 
 
 def test_lists_by_comma_or_tab(tmp_path):
@@ -124,19 +126,19 @@ def beside_gpu(monkeypatch):
     """As on a GPU, processes write; takes what is called with every pair's place before it is written."""
 
     def let(before, writers=2):
-        class Watched(many.SeparateProcesses):
+        class Watched(many.WorkerProcesses):
             def call(self, function, *args):
                 before(super().call, function, args[0])
                 return super().call(function, *args)
 
-        monkeypatch.setattr(many, "SeparateProcesses", Watched)
-        monkeypatch.setattr(many, "available_cores", lambda: many.CORES_OF_STAGES + writers)
+        monkeypatch.setattr(many, "WorkerProcesses", Watched)
+        monkeypatch.setattr(many, "available_cores", lambda: many.RESERVED_CORES + writers)
 
     monkeypatch.setattr(many, "leaves_cpu_free", lambda device: True)
     return let
 
 
-def test_beside_a_gpu_other_processes_write_the_same_files(geodiff, fresh, made, beside_gpu):
+def test_with_a_gpu_other_processes_write_the_same_files(geodiff, fresh, made, beside_gpu):
     calls = []
     beside_gpu(lambda call, function, place: calls.append(function.__name__))
     threads = torch.get_num_threads()
@@ -164,11 +166,11 @@ def test_a_process_that_writes_and_has_ended_ends_the_run_and_the_same_command_g
     beside_gpu(end, writers=1)
     answer = geodiff(*COMMAND)
     assert answer.code == 2 and answer.err.count("geodiff: ") == 1
-    assert "A helper process has ended (exit code 9). Is there enough memory?" in answer.err
+    assert "A worker process ended (exit code 9). Check that there is enough memory." in answer.err
     assert Path("out/a/report.json").exists() and not Path("out/b").exists()
     monkeypatch.setattr(many, "leaves_cpu_free", lambda device: False)
     answer = geodiff(*COMMAND)
-    assert answer.code == 0 and "0 failed" in answer.out and "0 there" not in answer.out
+    assert answer.code == 0 and "0 failed" in answer.out and "0 already done" not in answer.out
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no signal to a thread")
@@ -188,39 +190,41 @@ def test_ctrl_c_while_several_processes_write_leaves_whole_folders(geodiff, fres
         assert set(os.listdir(folder)) == set(report_of(folder)["files"]["names"])
     monkeypatch.setattr(many, "leaves_cpu_free", lambda device: False)
     answer = geodiff(*COMMAND)
-    assert answer.code == 0 and "0 failed" in answer.out and f"{len(folders)} there" in answer.out
+    assert answer.code == 0 and "0 failed" in answer.out and f"{len(folders)} already done" in answer.out
 
 
 @pytest.mark.parametrize(("writers", "started"), [(3, [3]), (0, [])])
-def test_the_stages_start_as_many_writers_as_they_are_told(monkeypatch, writers, started):
+def test_the_stages_start_the_given_number_of_writers(monkeypatch, writers, started):
     counts = []
-    monkeypatch.setattr(many, "SeparateProcesses", lambda module, count: counts.append(count))
+    monkeypatch.setattr(many, "WorkerProcesses", lambda module, count: counts.append(count))
     many.Stages(DepthOptions(left=Path("left")), torch.device("cuda"), writers=writers)
     assert counts == started
 
 
-def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, finished):
+def test_finished_pairs_are_skipped_and_overwrite_recomputes_them(geodiff, finished):
     made = [path.stat().st_mtime_ns for path in DEPTHS]
     for path in (finished / "out" / "b").iterdir():
         path.unlink()
     answer = geodiff(*COMMAND)
-    assert answer.code == 0 and "1 done, 2 there already" in answer.out
+    assert answer.code == 0 and "1 done, 2 already done" in answer.out
     now = [path.stat().st_mtime_ns for path in DEPTHS]
     assert [a == b for a, b in zip(made, now, strict=True)] == [True, False, True]
-    assert "3 done, 0 there already" in geodiff(*COMMAND, "--overwrite").out
+    assert "3 done, 0 already done" in geodiff(*COMMAND, "--overwrite").out
 
 
 def test_results_of_other_options_or_files_are_not_taken_for_these(geodiff, finished):
     (finished / "out" / "b" / "report.json").unlink()  # so that there is something to do
     before = contents(finished / "out")
     answer = geodiff(*COMMAND, "--seed", 1)
-    assert answer.code == 2 and "a, made with --seed 0 instead of 1. Name another" in answer.err
+    assert answer.code == 2 and "a, made with --seed 0 instead of 1. Choose another" in answer.err
     for changed in (Path("right", "a.png"), Path("calib.txt")):
         whole = changed.read_bytes()
         changed.write_bytes(whole + b"\n")
         answer = geodiff(*COMMAND)
         assert answer.code == 2 and answer.err.count("\n") == 1
-        assert f"options and files; got {Path('out', 'a')}, made before {changed} changed. Name" in answer.err
+        assert (
+            f"options and files; got {Path('out', 'a')}, made before {changed} changed. Choose" in answer.err
+        )
         changed.write_bytes(whole)
     assert before == contents(finished / "out")
 
@@ -229,24 +233,25 @@ def test_a_finished_pair_is_judged_with_strict(geodiff, finished):
     for name, status in (("a", "trusted"), ("b", "not trusted"), ("c", "trusted")):
         report = report_of(f"out/{name}")
         report["verdict"] |= {"status": status, "reasons": ["E is wrong."]}
-        report["messages"] = [{"code": "pose.inverse"}, {"code": "verdict.not-trusted"}]
+        codes = ("depth.inverted-order", "verdict.not-trusted")
+        report["findings"] = [{"code": code, "severity": "reason", "text": ""} for code in codes]
         Path("out", name, "report.json").write_text(json.dumps(report))
     answer = geodiff(*COMMAND)
-    assert answer.code == 0 and "3 there already, 0 failed, 1 not trusted" in answer.out
+    assert answer.code == 0 and "3 already done, 0 failed, 1 not trusted" in answer.out
     answer = geodiff(*COMMAND, "--strict")
-    assert answer.code == 4 and "2 there already, 1 failed" in answer.out
+    assert answer.code == 4 and "2 already done, 1 failed" in answer.out
     assert f"geodiff: b: The depth in {Path('out', 'b')} is not trusted: E is wrong." in answer.err
-    assert [row["result"] for row in rows_of()] == ["there", "failed", "there"]
-    assert {row["codes"] for row in rows_of()} == {"pose.inverse verdict.not-trusted"}
+    assert [row["result"] for row in rows_of()] == ["kept", "failed", "kept"]
+    assert {row["codes"] for row in rows_of()} == {"depth.inverted-order verdict.not-trusted"}
 
 
 def test_a_broken_pair_and_a_defect_are_reported_and_the_rest_go_on(geodiff, fresh, monkeypatch):
     write = writing.write_pair
 
-    def broken(folder, run, **entries):
+    def broken(folder, run):
         if folder.path.name == "a":
             raise KeyError("nobody thought of this")
-        return write(folder, run, **entries)
+        return write(folder, run)
 
     monkeypatch.setattr(writing, "write_pair", broken)
     image = fresh / "right" / "b.png"
@@ -254,18 +259,18 @@ def test_a_broken_pair_and_a_defect_are_reported_and_the_rest_go_on(geodiff, fre
     answer = geodiff(*COMMAND)
     assert answer.code == 4 and "geodiff: b: RIGHT must be a whole image file" in answer.err
     assert answer.err.count("Traceback") == 1 and "nobody thought of this" in answer.err
-    assert "1 done, 0 there already, 2 failed" in answer.out
+    assert "1 done, 0 already done, 2 failed" in answer.out
     assert [row["result"] for row in rows_of()] == ["failed", "failed", "done"]
     assert not (fresh / "out" / "b").exists()
 
 
-def test_what_fails_all_pairs_is_said_once_before_the_prior_is_loaded(geodiff, fresh, monkeypatch):
+def test_an_error_of_all_pairs_is_reported_once_before_the_prior_is_loaded(geodiff, fresh, monkeypatch):
     monkeypatch.setattr(many, "prior_of_options", never)
     for path in (fresh / "right").iterdir():
         path.write_bytes(path.read_bytes()[:60])
     answer = geodiff(*COMMAND)
     assert answer.code == 2 and answer.err.count("geodiff: ") == 1, answer.err
-    assert "The same holds for all 3 pairs; nothing was computed." in answer.err
+    assert "All 3 pairs failed for this reason; nothing was computed." in answer.err
     assert not (fresh / "out").exists() and not list(fresh.glob(".out*"))
 
 
@@ -274,7 +279,7 @@ def test_a_list_with_a_calibration_each_and_maps_of_another_model(geodiff, fresh
     Path("maps").mkdir()
     for name in "ab":
         np.save(f"maps/{name}.npy", np.add.outer(np.arange(24.0), np.ones(32)))
-    words = "depth pairs.csv --out out --prior-map maps --device cpu --knob inner_steps=0".split()
+    words = "depth pairs.csv --out out --prior-map maps --device cpu --set guidance_steps=0".split()
     answer = geodiff(*words, "--json")
     assert answer.code == 0, answer.err
     assert [row["pair"] for row in json.loads(answer.out)] == ["a", "b"]
@@ -295,11 +300,14 @@ def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(geodiff, fresh, mon
     monkeypatch.setattr(writing, "write_pair", full)
     answer = geodiff(*COMMAND)
     assert answer.code == 2 and answer.err.count("exceeded") == 1
-    assert "is full (Disk quota exceeded). Finished pairs stay; the same command goes on" in answer.err
+    assert (
+        "is full (Disk quota exceeded). Finished pairs are kept; run the same command again to resume"
+        in answer.err
+    )
     assert Path("out/a/report.json").exists() and not Path("out/b").exists()
     monkeypatch.setattr(writing, "write_pair", write)
     answer = geodiff(*COMMAND)
-    assert answer.code == 0 and "0 failed" in answer.out and "0 there" not in answer.out
+    assert answer.code == 0 and "0 failed" in answer.out and "0 already done" not in answer.out
 
 
 # Shards
@@ -310,7 +318,7 @@ def test_shards_in_turn_give_what_the_whole_run_gives_and_merge_joins_their_tabl
     torch.set_num_threads(1)
     assert geodiff(*COMMAND, "-q", "--shard", "0/2").code == 0
     answer = geodiff("merge", "out")
-    assert answer.code == 2 and "Shards have no table yet: run --shard 1/2." in answer.err
+    assert answer.code == 2 and "Tables of shards are missing. Run --shard 1/2." in answer.err
     answer = geodiff(*COMMAND, "--shard", "1/2")
     torch.set_num_threads(threads)
     assert answer.code == 0 and "1 pair: 1 done" in answer.out
@@ -321,14 +329,17 @@ def test_shards_in_turn_give_what_the_whole_run_gives_and_merge_joins_their_tabl
         of_whole = np.load(made / "out" / name / "depth.npy")
         np.testing.assert_array_equal(np.load(f"out/{name}/depth.npy"), of_whole)
     answer = geodiff(*COMMAND)
-    assert "0 done, 3 there already" in answer.out
+    assert "0 done, 3 already done" in answer.out
 
 
-def test_what_shards_cannot_do_is_said(geodiff, fresh):
-    assert "--shard is for many pairs" in geodiff("depth", "left/a.png", "right/a.png", "--shard", "0/2").err
+def test_what_shards_cannot_do_is_reported(geodiff, fresh):
+    assert "--shard needs many pairs" in geodiff("depth", "left/a.png", "right/a.png", "--shard", "0/2").err
     assert "--shard must be I/N" in geodiff(*COMMAND, "--shard", "2/2").err
-    assert "--steady needs all frames" in geodiff(*COMMAND, "--shard", "0/2", "--steady").err
-    assert "holds no table of a shard" in geodiff("merge", "left").err
+    assert (
+        "--temporal-smoothing needs all frames"
+        in geodiff(*COMMAND, "--shard", "0/2", "--temporal-smoothing").err
+    )
+    assert "has no table of a shard" in geodiff("merge", "left").err
 
 
 def test_without_ray_its_extra_is_named(geodiff, fresh, monkeypatch):
@@ -337,7 +348,7 @@ def test_without_ray_its_extra_is_named(geodiff, fresh, monkeypatch):
     for name in ("ray", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
     for way in ("folders", "parquet"):
-        answer = geodiff(*COMMAND, "--engine", "ray", "--as", way)
+        answer = geodiff(*COMMAND, "--engine", "ray", "--format", way)
         assert answer.code == 2 and "pip install 'geodiff-plugin[ray]'" in answer.err, answer.err
     assert not (fresh / "out").exists()
 
@@ -369,14 +380,14 @@ def test_the_video_of_a_rig(geodiff, fresh, textured_plane, videos):
     assert report["pair"]["frame"] == 1 and report["inputs"]["right_size"] == [64, 48]
     alone = [np.load(f"out/{name}/depth.npy") for name in ("000000", "000001")]
     for _ in range(2):  # again from what the frames gave alone
-        answer = geodiff("depth", *videos, *words, "--steady")
-        assert answer.code == 0 and "2 there already" in answer.out, answer.err
+        answer = geodiff("depth", *videos, *words, "--temporal-smoothing")
+        assert answer.code == 0 and "2 already done" in answer.out, answer.err
     for name, depth in zip(("000000", "000001"), alone, strict=True):
         assert np.array_equal(np.load(f"out/{name}/depth_alone.npy"), depth)
-        steady, confirmed = (np.load(f"out/{name}/{file}.npy") for file in ("depth", "confirmed"))
-        assert report_of(f"out/{name}")["steady"] == {"scene": 0}
-        assert confirmed.mean() > 0.5 and 0 < np.abs(np.log(steady / depth)).max() < 0.1
-    answer = geodiff("depth", *videos, *words, "--overwrite")  # nothing of --steady is left
+        temporal_smoothing, confirmed = (np.load(f"out/{name}/{file}.npy") for file in ("depth", "confirmed"))
+        assert report_of(f"out/{name}")["temporal_smoothing"] == {"scene": 0}
+        assert confirmed.mean() > 0.5 and 0 < np.abs(np.log(temporal_smoothing / depth)).max() < 0.1
+    answer = geodiff("depth", *videos, *words, "--overwrite")  # nothing of --temporal-smoothing is left
     assert answer.code == 0 and not list(Path("out").glob("*/*_alone.npy")), answer.err
     answer = geodiff("depth", *videos, *words, "--export", "colmap", "--overwrite")
-    assert answer.code == 2 and "--export colmap does not take a video" in answer.err
+    assert answer.code == 2 and "--export colmap does not support videos" in answer.err

@@ -1,4 +1,4 @@
-"""Pictures of 12 and of 48 megapixels: what they need, and one sentence where they do not fit the memory."""
+"""Images of 12 and of 48 megapixels: what they need, and one sentence where they do not fit the memory."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ pytestmark = [
 ]
 GIB = 1 << 30
 #: A pair of 48 megapixels needed 10.3 GB.
-MOST_BYTES = 12 * GIB
+MAX_BYTES = 12 * GIB
 
 
 def write_pair(folder: Path, width: int, height: int) -> list[str]:
@@ -53,7 +53,7 @@ def test_twelve_megapixels_that_do_not_fit_are_one_sentence(gib, tmp_path):
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     (said,) = (line for line in done.stderr.splitlines() if line.startswith("geodiff:"))
-    assert "of 4000x3000 pixels (12.0 megapixels) does not fit the memory. Make the pictures smaller" in said
+    assert "of 4000x3000 pixels (12.0 megapixels) does not fit in memory. Downscale the images" in said
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
 
@@ -65,6 +65,6 @@ def test_forty_eight_megapixels_need_a_bounded_memory(tmp_path):
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
     assert process.returncode == 0, said
-    assert used.ru_maxrss * 1024 < MOST_BYTES
+    assert used.ru_maxrss * 1024 < MAX_BYTES
     depth = np.load(tmp_path / "out/depth.npy", mmap_mode="r")
     assert depth.shape == (6000, 8000) and np.isfinite(depth[::100, ::100]).all()

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from geodiff_plugin._checks import InputFileError
+from geodiff_plugin._internal.checks import InputFileError
 from geodiff_plugin.formats import out as out_module
 from geodiff_plugin.formats.out import PARTIAL, OutFolder, free_folder
 
@@ -62,7 +62,7 @@ def test_what_ends_amid_the_writing_loses_nothing_and_strews_nothing(tmp_path, e
 
 
 def test_files_of_an_earlier_run_are_replaced_and_others_stay(tmp_path, monkeypatch):
-    """The report lists those, and goes last: cut off before, it still says which; after, all is done."""
+    """The report lists them and is deleted last, so that an interrupted deletion can continue."""
     for name in ("notes.txt", "depth.npy", "cloud.ply", "cameras.txt"):
         (tmp_path / name).write_text("old")
     (tmp_path / "report.json").write_text(report_of("depth.npy", "cloud.ply", "gone.npy"))
@@ -93,7 +93,7 @@ def test_a_report_of_something_else_deletes_nothing(tmp_path, report):
 
 
 @pytest.mark.parametrize("fault", [errno.EACCES, errno.ENOSPC])
-def test_a_folder_that_takes_no_file_is_refused_before_the_work(tmp_path, monkeypatch, fault):
+def test_a_folder_that_takes_no_file_is_rejected_before_the_work(tmp_path, monkeypatch, fault):
     """By the first byte: whether a folder is read-only or a disk full shows no sooner to everybody."""
 
     def no_file(*_, **__):
@@ -106,7 +106,7 @@ def test_a_folder_that_takes_no_file_is_refused_before_the_work(tmp_path, monkey
     assert os.strerror(fault) in refused(tmp_path / "a" / "out") and names(tmp_path) == []
 
 
-def test_a_second_run_is_refused(tmp_path):
+def test_a_second_run_is_rejected(tmp_path):
     out, process = tmp_path / "out", "another process is writing to"
     with OutFolder(out) as held:
         assert process in refused(out) and process in refused(tmp_path / "." / "out")

@@ -1,4 +1,4 @@
-"""Small inputs in public forms, each with the command that a user types, against the truth beside them."""
+"""Small inputs in public formats, each with the command of a user, compared with their ground truth."""
 
 import json
 import re
@@ -26,17 +26,22 @@ pytestmark = [
     pytest.mark.usefixtures("one_prior"),
 ]
 CASES = sorted(path.name for path in INPUTS.glob("*") if path.name[0] != "_") if TRUTH.is_dir() else []
-#: Commands of the inputs that work as they are, beside which the others were made.
+#: Commands of the inputs that work as they are, next to which the others were made.
 TWINS = {
     "00_base_tj": "capture .",
     "00_base_colmap": "capture . --metres-per-unit 1",
-    "b_base_rgb8": "depth drive.mcap --left /left/image_rect --right /right/image_rect --out o.mcap",
+    "b_base_rgb8": "depth drive.mcap --left-topic /left/image_rect --right-topic /right/image_rect "
+    "--out o.mcap",
     "p00_base": "depth left.jpg right.jpg CAMERAS",
 }
 #: The frame that gets depth, by its number; the poses are those of all.
 FRAME, TRUTH_OF_FRAME = 1, "frame_0104.png"
 #: Mean relative errors: by two views with the small prior, and by known depths of half the pixels.
 BY_VIEWS, BY_DEPTHS = 0.2, 0.05
+
+
+#: Options that the recorded commands call by an earlier name.
+RENAMED = {"--left": "--left-topic", "--right": "--right-topic"}
 
 
 def typed(case: str) -> list[str]:
@@ -46,15 +51,18 @@ def typed(case: str) -> list[str]:
     if "p14" in text or "CAMERAS" in text:
         cameras = typed("p14_mpo")[2:]
         text = re.sub(r"\(cameras as p14\)|CAMERAS", shlex.join(cameras), text)
-    return shlex.split(text)
+    return [RENAMED.get(word, word) for word in shlex.split(text)]
 
 
 def mean_error(depth: np.ndarray, truth_file: str) -> float:
-    """Mean relative error on the grid of the truth, where that is known."""
-    truth = np.asarray(Image.open(TRUTH / truth_file)).astype(float) / 1000
-    at = [((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(truth.shape, depth.shape, strict=True)]
-    there = truth > 0
-    return float(np.abs(depth[np.ix_(*at)][there] / truth[there] - 1).mean())
+    """Mean relative error on the grid of ground truth, where that is known."""
+    ground_truth = np.asarray(Image.open(TRUTH / truth_file)).astype(float) / 1000
+    at = [
+        ((np.arange(n) + 0.5) * m / n).astype(int)
+        for n, m in zip(ground_truth.shape, depth.shape, strict=True)
+    ]
+    there = ground_truth > 0
+    return float(np.abs(depth[np.ix_(*at)][there] / ground_truth[there] - 1).mean())
 
 
 def depth_of_bag(path: Path) -> np.ndarray:
@@ -75,14 +83,15 @@ def loaded(name: str, device: torch.device) -> Any:
 @pytest.fixture
 def one_prior(monkeypatch):
     """The prior is loaded once for all cases."""
-    for module in ("capture", "prior"):
-        monkeypatch.setattr(
-            f"geodiff_plugin.jobs.{module}.load_quiet_prior", lambda name, device, *_: loaded(name, device)
-        )
+
+    def load(name, device, *_):
+        return loaded(name, device)
+
+    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_quiet_prior", load)
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_an_input_of_the_world_is_right_or_kindly_refused(case, geodiff, tmp_path, monkeypatch):
+def test_a_public_input_is_correct_or_rejected_with_a_clear_error(case, geodiff, tmp_path, monkeypatch):
     if case.startswith("b_"):
         pytest.importorskip("rosbags")
     monkeypatch.chdir(INPUTS / case)
@@ -94,19 +103,23 @@ def test_an_input_of_the_world_is_right_or_kindly_refused(case, geodiff, tmp_pat
     words += [] if case in TWINS else ["--steps", "1"]
     answer = geodiff(*words, "--out", out, "-q")
     if case == "d_negative_npy":
-        assert answer.code == 2 and "Right minus left" in answer.err and "-disparity" in answer.err
+        assert answer.code == 2 and "right minus left" in answer.err and "-disparity" in answer.err
         return
     assert answer.code == 0, answer.err
     if words[0] == "capture":
         report = json.loads((out / "capture.json").read_text())
         (frame,) = report["frames"]
-        depth, verdict, truth = np.load(out / frame["frame"] / "depth.npy"), frame["verdict"], TRUTH_OF_FRAME
+        depth, verdict, ground_truth = (
+            np.load(out / frame["frame"] / "depth.npy"),
+            frame["verdict"],
+            TRUTH_OF_FRAME,
+        )
     elif case.startswith("b_"):
-        depth, verdict, truth = depth_of_bag(out), None, "pair.png"
+        depth, verdict, ground_truth = depth_of_bag(out), None, "pair.png"
     else:
         verdict = json.loads((out / "report.json").read_text())["verdict"]
-        depth, truth = np.load(out / "depth.npy"), "pair.png"
-    error = mean_error(depth, truth)
+        depth, ground_truth = np.load(out / "depth.npy"), "pair.png"
+    error = mean_error(depth, ground_truth)
     if case == DOUBTED_UNIT:
         assert verdict["status"] != "trusted" and error > 10
         return

@@ -10,16 +10,19 @@ from PIL import Image
 
 from geodiff_plugin import plotting
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.lenses import distortion_from_text, undistorted
 from tests.cli.conftest import QUICK, report_of
 
+pytestmark = pytest.mark.end_to_end
+
 LENS = "-0.2,0.05,0,0"
 
 
-def test_exports_stand_beside_the_ply(geodiff, textured_plane, command):
+def test_exports_are_next_to_the_ply(geodiff, textured_plane, command):
     out, exports = Path("geodiff-out"), "--export glb --export mesh --export colmap".split()
-    assert geodiff(*command, "--knob", "inner_steps=0", *exports).code == 0
+    assert geodiff(*command, "--set", "guidance_steps=0", *exports).code == 0
     assert all((out / f"{name}.glb").read_bytes()[:4] == b"glTF" for name in ("cloud", "mesh"))
     rig = read_calibration(out, image_names=("left.png", "right.png"), baseline_m=0.12)
     np.testing.assert_allclose(rig.E, textured_plane.E, atol=1e-6)
@@ -32,7 +35,7 @@ def test_a_colmap_model_names_what_its_cameras_took(geodiff, command, pair_files
     Image.fromarray(255 - np.asarray(Image.open(pair_files.right))).save("third.png")
     np.savetxt("pose.txt", np.eye(4) + 0.12 * np.eye(4, k=3))
     camera = f"--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12 --distortion {LENS}".split()
-    camera += "--steps 1 --knob inner_steps=0 -q --export colmap".split()
+    camera += "--steps 1 --set guidance_steps=0 -q --export colmap".split()
     view = ["--view", "third.png", "--view-E", "pose.txt", "--view-distortion", "0,0,0,0"]
     answer = geodiff(*command[:3], *command[5:], *camera, *view)
     assert answer.code == 0, answer.err
@@ -43,14 +46,14 @@ def test_a_colmap_model_names_what_its_cameras_took(geodiff, command, pair_files
     assert rig.size_right == (64, 48) and rig.K_left[0, 0] == 60
     for name, path, lens in ((written[1], "right.png", LENS), (written[2], "third.png", "0,0,0,0")):
         image_01 = np.asarray(Image.open(path), np.float32) / 255
-        expected = undistorted(image_01, rig.K_left, distortion_from_text(lens))
+        expected = undistorted(image_01, Camera(rig.K_left, lens=distortion_from_text(lens)))
         image = np.asarray(Image.open(out / name), np.float32) / 255
         assert np.abs(image - expected).mean() < 0.01, "but for cleaning"
     assert set(report_of()["files"]["names"]) == {path.name for path in out.iterdir()}
 
 
 def test_exported_cameras_are_those_that_the_cloud_fits(geodiff, prior, tmp_path, monkeypatch):
-    """Of refined poses: the given ones leave the cloud beside what the right photograph shows."""
+    """Of refined poses: the given ones leave the cloud next to what the right image shows."""
     monkeypatch.chdir(tmp_path)
     pair, turn = read_demo_pair(), np.radians(1.0)
     moved = pair.rig.E.copy()
@@ -94,7 +97,7 @@ def test_video(geodiff, maps, name):
         assert np.abs(first - np.asarray(video.convert("RGB"))).mean() > 10, "one range: it is farther"
 
 
-def test_a_video_has_metres_unless_a_report_says_that_there_are_none(geodiff, maps, monkeypatch):
+def test_a_video_is_in_metres_unless_a_report_states_otherwise(geodiff, maps, monkeypatch):
     units, drawn = [], plotting.depth_frames
 
     def noting(*arguments, **named):

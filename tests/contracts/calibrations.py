@@ -89,7 +89,7 @@ def kalibr_fisheye(rig: Drawn) -> tuple[str, ...]:
 
 
 def kalibr_openvins(rig: Drawn, key: str = "T_imu_cam") -> tuple[str, ...]:
-    """OpenVINS' chain: no camera says where it is beside another, each where it is beside the IMU."""
+    """OpenVINS' chain: cameras state their pose relative to the IMU, not to each other."""
     chain = yaml.safe_load(kalibr(rig)[0])
     del chain["cam1"]["T_cn_cnm1"]
     for n, T in enumerate(rig.worlds):
@@ -136,7 +136,7 @@ def basalt_fisheye(rig: Drawn) -> tuple[str, ...]:
 
 
 def vins(rig: Drawn, kind: str = "PINHOLE") -> tuple[str, ...]:
-    """A configuration, and the two files that it names beside itself."""
+    """A configuration, and the two files that it names next to itself."""
     K_names, lens_names = {
         "PINHOLE": ("fx fy cx cy", "k1 k2 p1 p2"),
         "KANNALA_BRANDT": ("mu mv u0 v0", "k2 k3 k4 k5"),
@@ -259,7 +259,7 @@ def okvis_fisheye(rig: Drawn) -> tuple[str, ...]:
 
 
 def svo(rig: Drawn, name: str = "T_B_C", model: str = "radial-tangential") -> tuple[str, ...]:
-    """A rig of SVO: matrices with rows and columns, the camera beside its pose."""
+    """A rig of SVO: matrices with rows and columns, the camera next to its pose."""
 
     def matrix(values, columns: int) -> dict[str, Any]:
         data = np.ravel(values).tolist()
@@ -382,7 +382,7 @@ def mc_calib_fisheye(rig: Drawn) -> tuple[str, ...]:
 
 
 def multical(rig: Drawn, relative: bool = False) -> tuple[str, ...]:
-    """calibration.json: world-to-camera, or with a master the pose of the other beside it."""
+    """calibration.json: world-to-camera, or with a master the pose of the other next to it."""
     names = ("left_00123", "right_00124")
     cameras = {
         name: {"model": "standard", "image_size": list(rig.size), "K": K.tolist(), "dist": [lens]}
@@ -538,10 +538,10 @@ def realsense_printed(rig: Drawn) -> tuple[str, ...]:
 
 def oak(rig: Drawn) -> tuple[str, ...]:
     """The left camera (socket 1) is linked to the right one (2), that to the colour camera (0)."""
-    links = {1: (2, rig.T), 2: (0, rigid([0, 0, 0], [0.04, 0, 0])), 0: (-1, np.eye(4))}
+    affinities = {1: (2, rig.T), 2: (0, rigid([0, 0, 0], [0.04, 0, 0])), 0: (-1, np.eye(4))}
     cameras = []
     for n, socket in ((1, 2), (0, 1), (1, 0)):
-        to, T = links[socket]
+        to, T = affinities[socket]
         shift = dict(zip("xyz", (100 * T[:3, 3]).tolist(), strict=True))
         extrinsics = {"toCameraSocket": to, "rotationMatrix": T[:3, :3].tolist(), "translation": shift}
         entries = {"cameraType": 0, "distortionCoeff": rig.lenses[n] + [0.0] * 10, "extrinsics": extrinsics}
@@ -673,7 +673,7 @@ SAMPLES = {w.__name__: w(RIG) for w in ANY_POSE + RECTIFIED + ONE_CAMERA if "fis
 
 
 def choice(sample: str, baseline_m: float = 0.12) -> dict[str, Any]:
-    """What ``read_calibration`` needs beside the text."""
+    """What ``read_calibration`` needs next to the text."""
     by_name = {"image_names": NAMES, "baseline_m": baseline_m}
     needed = {"zed": {"image_size": (1280, 720)}, "colmap": by_name, "nerf": by_name}
     needed |= {"vkitti": {"image_names": ("Camera_0/rgb_00002.jpg", "Camera_1/rgb_00002.jpg")}}
@@ -683,7 +683,7 @@ def choice(sample: str, baseline_m: float = 0.12) -> dict[str, Any]:
 
 
 def written(folder: Path, texts: tuple[str, ...]) -> Path | tuple[Path, ...]:
-    """Files of names that say nothing: formats are recognised by content."""
+    """Files with arbitrary names: formats are recognised by content."""
     paths = tuple(folder / f"file{i}.dat" for i in range(len(texts)))
     for path, text in zip(paths, texts, strict=True):
         path.write_text(text)

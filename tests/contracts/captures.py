@@ -21,7 +21,7 @@ TARTAN_SIZE = (640, 480)
 
 @dataclass(frozen=True)
 class Twin:
-    """A written capture and what must be read of it, beside the poses ``TRUE``."""
+    """A written capture and what must be read of it, next to the poses ``TRUE``."""
 
     path: Path
     K: np.ndarray = field(default_factory=K.copy)
@@ -32,7 +32,7 @@ class Twin:
     file: str = ""  # that describes the cameras, below ``path``
 
 
-def pictures(folder: Path, names, matrix=K, size=SIZE) -> None:
+def images(folder: Path, names, matrix=K, size=SIZE) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, E in zip(names, TRUE, strict=True):
         Image.fromarray(render(E, size, matrix)[0]).save(folder / name)
@@ -56,8 +56,8 @@ def words(values) -> str:
 def polycam(folder: Path) -> Twin:
     keyframes = folder / "keyframes"
     stems = [f"16680000{i}0" for i in range(4)]
-    pictures(keyframes / "corrected_images", [f"{stem}.png" for stem in stems])
-    pictures(keyframes / "images", [f"{stem}.png" for stem in stems])  # before Polycam's own adjustment
+    images(keyframes / "corrected_images", [f"{stem}.png" for stem in stems])
+    images(keyframes / "images", [f"{stem}.png" for stem in stems])  # before Polycam's own adjustment
     depths(keyframes / "depth", [f"{stem}.png" for stem in stems])
     for place, off in (("corrected_cameras", 0.0), ("cameras", 0.3)):
         (keyframes / place).mkdir()
@@ -72,7 +72,7 @@ def polycam(folder: Path) -> Twin:
 
 
 def record3d(folder: Path) -> Twin:
-    pictures(folder / "rgb", [f"{i}.png" for i in range(4)])
+    images(folder / "rgb", [f"{i}.png" for i in range(4)])
     poses = [[*quaternion(E @ FLIP), *E[:3, 3].tolist()] for E in TRUE]
     by_columns = (K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]).T.ravel().tolist()
     entries = {"K": by_columns, "poses": poses, "w": SIZE[0], "h": SIZE[1], "dw": 192, "dh": 144, "fps": 60}
@@ -100,9 +100,9 @@ def euroc(folder: Path) -> Twin:
     T_body_camera = np.eye(4)
     T_body_camera[:3, :3] = Rotation.from_rotvec([0.1, -1.5, 0.2]).as_matrix()
     T_body_camera[:3, 3] = -0.02, -0.06, 0.01
-    cam, truth = folder / "mav0" / "cam0", folder / "mav0" / "state_groundtruth_estimate0"
+    cam, ground_truth = folder / "mav0" / "cam0", folder / "mav0" / "state_groundtruth_estimate0"
     stamps = [1403636579763555584 + 50_000_000 * i for i in range(4)]
-    pictures(cam / "data", [f"{ns}.png" for ns in stamps])
+    images(cam / "data", [f"{ns}.png" for ns in stamps])
     pose = {"rows": 4, "cols": 4, "data": T_body_camera.ravel().tolist()}
     sensor = {"sensor_type": "camera", "T_BS": pose, "rate_hz": 20, "resolution": list(SIZE)}
     sensor |= {"camera_model": "pinhole", "intrinsics": [200.0, 205.0, 118.0, 91.0]}
@@ -110,7 +110,7 @@ def euroc(folder: Path) -> Twin:
     (cam / "sensor.yaml").write_text(yaml.safe_dump(sensor))
     listed = "".join(f"{ns},{ns}.png\n" for ns in stamps)
     (cam / "data.csv").write_text("#timestamp [ns],filename\n" + listed)
-    truth.mkdir()
+    ground_truth.mkdir()
     rows = (
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
     )
@@ -118,12 +118,12 @@ def euroc(folder: Path) -> Twin:
         body = E @ np.linalg.inv(T_body_camera)
         x, y, z, w = quaternion(body)
         rows += f"{ns}," + words([*body[:3, 3], w, x, y, z, 0.1, 0.2, 0.3]).replace(" ", ",") + "\n"
-    (truth / "data.csv").write_text(rows)
+    (ground_truth / "data.csv").write_text(rows)
     return Twin(folder, file="mav0/state_groundtruth_estimate0/data.csv")
 
 
 def tartanair(folder: Path) -> Twin:
-    pictures(folder / "image_left", [f"{i:06d}_left.png" for i in range(4)], TARTAN, TARTAN_SIZE)
+    images(folder / "image_left", [f"{i:06d}_left.png" for i in range(4)], TARTAN, TARTAN_SIZE)
     ned_from_opencv = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     rows = []
     for E in TRUE:
@@ -139,7 +139,7 @@ def tartanair(folder: Path) -> Twin:
 
 def kitti_odometry(folder: Path) -> Twin:
     sequence = folder / "sequences" / "04"
-    pictures(sequence / "image_2", [f"{i:06d}.png" for i in range(4)])
+    images(sequence / "image_2", [f"{i:06d}.png" for i in range(4)])
     place = np.array([0.06, -0.002, 0.004])  # of camera 2 in camera 0's frame
     P0, P2 = (words(K @ np.column_stack([np.eye(3), -t])) for t in (np.zeros(3), place))
     (sequence / "calib.txt").write_text(
@@ -154,7 +154,7 @@ def kitti_odometry(folder: Path) -> Twin:
 
 
 def mvsnet(folder: Path) -> Twin:
-    pictures(folder / "images", [f"{i:08d}.png" for i in range(4)])
+    images(folder / "images", [f"{i:08d}.png" for i in range(4)])
     (folder / "cams").mkdir()
     for i, E in enumerate(TRUE):
         rows = ["extrinsic", *(words(row) for row in np.linalg.inv(E)), "", "intrinsic", *map(words, K)]
@@ -164,7 +164,7 @@ def mvsnet(folder: Path) -> Twin:
 
 def metashape(folder: Path) -> Twin:
     """Three sensors' worth of structure in one: groups, a component's scale, a label with folders."""
-    pictures(folder / "images", [f"IMG_{i}.JPG.png" for i in range(4)])
+    images(folder / "images", [f"IMG_{i}.JPG.png" for i in range(4)])
     scale = 2.5
     f, cx, cy = (float(v) for v in (K[1, 1], K[0, 2] + 0.5 - SIZE[0] / 2, K[1, 2] + 0.5 - SIZE[1] / 2))
     size = f'<resolution width="{SIZE[0]}" height="{SIZE[1]}"/>'
@@ -189,7 +189,7 @@ def metashape(folder: Path) -> Twin:
 
 
 def opensfm(folder: Path) -> Twin:
-    pictures(folder / "images", [f"i{i}.png" for i in range(4)])
+    images(folder / "images", [f"i{i}.png" for i in range(4)])
     longer = max(SIZE)
     camera = {
         "projection_type": "brown",
@@ -213,7 +213,7 @@ def opensfm(folder: Path) -> Twin:
 
 
 def bundler(folder: Path) -> Twin:
-    pictures(folder / "images", [f"i{i}.png" for i in range(4)], CENTRAL)
+    images(folder / "images", [f"i{i}.png" for i in range(4)], CENTRAL)
     text = "# Bundle file v0.3\n4 1\n"
     for E in TRUE:
         T = FLIP @ np.linalg.inv(E)
@@ -225,7 +225,7 @@ def bundler(folder: Path) -> Twin:
 
 
 def nvm(folder: Path) -> Twin:
-    pictures(folder, [f"i{i}.png" for i in range(4)], CENTRAL)
+    images(folder, [f"i{i}.png" for i in range(4)], CENTRAL)
     text = "NVM_V3 \n \n4  \n"
     for i, E in enumerate(TRUE):
         x, y, z, w = quaternion(np.linalg.inv(E))
@@ -235,16 +235,16 @@ def nvm(folder: Path) -> Twin:
 
 
 def log(folder: Path) -> Twin:
-    pictures(folder / "images", [f"{i:06d}.png" for i in range(4)])
+    images(folder / "images", [f"{i:06d}.png" for i in range(4)])
     rows = [line for i, E in enumerate(TRUE) for line in (f"{i} {i} 0", *(words(row) for row in E))]
     (folder / "Barn_COLMAP_SfM.log").write_text("\n".join(rows) + "\n")
     return Twin(folder, unit=None, typed=K, file="Barn_COLMAP_SfM.log")
 
 
 def replica(folder: Path) -> Twin:
-    """A scene of NICE-SLAM's Replica; the file of its camera lies beside the scenes."""
+    """A scene of NICE-SLAM's Replica; the file of its camera lies next to the scenes."""
     scene = folder / "room0"
-    pictures(scene / "results", [f"frame00000{i}.png" for i in range(4)])
+    images(scene / "results", [f"frame00000{i}.png" for i in range(4)])
     depths(scene / "results", [f"depth00000{i}.png" for i in range(4)], 6553.5)
     camera = {"w": SIZE[0], "h": SIZE[1], "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     (folder / "cam_params.json").write_text(json.dumps({"camera": camera | {"scale": 6553.5}}))
@@ -254,7 +254,7 @@ def replica(folder: Path) -> Twin:
 
 def three_rscan(folder: Path) -> Twin:
     """A sequence of 3RScan, or an older one of ScanNet, whose camera is that of ``_info.txt``."""
-    pictures(folder, [f"frame-00000{i}.color.png" for i in range(4)])
+    images(folder, [f"frame-00000{i}.color.png" for i in range(4)])
     depths(folder, [f"frame-00000{i}.depth.png" for i in range(4)], 5000.0)
     for i, E in enumerate(TRUE):
         (folder / f"frame-00000{i}.pose.txt").write_text("\n".join(words(row) for row in E))
@@ -271,7 +271,7 @@ def three_rscan(folder: Path) -> Twin:
 
 def scanner_app(folder: Path) -> Twin:
     """All data of 3D Scanner App, whose matrices stand in rows; one frame was recorded without its image."""
-    pictures(folder, [f"frame_{i:05d}.png" for i in range(4)])
+    images(folder, [f"frame_{i:05d}.png" for i in range(4)])
     depths(folder, [f"depth_{i:05d}.png" for i in range(4)])
     for i, E in enumerate([*TRUE, TRUE[0]]):
         entries = {"cameraPoseARFrame": (E @ FLIP).ravel().tolist(), "frame_index": i, "motionQuality": 0.9}
@@ -284,7 +284,7 @@ def arkitscenes(folder: Path) -> Twin:
     frames = folder / f"{folder.name}_frames"
     times = [f"{305.377 + 0.1 * i:.3f}" for i in range(4)]
     names = [f"{folder.name}_{t}" for t in times]
-    pictures(frames / "lowres_wide", [f"{name}.png" for name in names])
+    images(frames / "lowres_wide", [f"{name}.png" for name in names])
     depths(frames / "lowres_depth", [f"{name}.png" for name in names])
     (frames / "lowres_wide_intrinsics").mkdir()
     rows = []

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.contracts.captures import CENTRAL, TRUE, Twin, pictures, words
+from tests.contracts.captures import CENTRAL, TRUE, Twin, images, words
 from tests.unit.capture_room import SIZE, K
 
 #: LLFF's axes are down, right, backwards.
@@ -13,8 +13,8 @@ LLFF_FROM_OPENCV = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
 
 def splats(folder: Path) -> Twin:
-    """A result beside the images that it was trained on; names have no suffix."""
-    pictures(folder / "images", [f"DSC_{i}.png" for i in range(4)], CENTRAL)
+    """A result next to the images that it was trained on; names have no suffix."""
+    images(folder / "images", [f"DSC_{i}.png" for i in range(4)], CENTRAL)
     cameras = []
     for i, E in enumerate(TRUE):
         place = {"position": E[:3, 3].tolist(), "rotation": E[:3, :3].tolist()}
@@ -29,7 +29,7 @@ def splats(folder: Path) -> Twin:
 def llff(folder: Path) -> Twin:
     """Rows are in the order of names as text: 10 comes before 2."""
     names = ["img1.png", "img10.png", "img2.png", "img3.png"]
-    pictures(folder / "images", names, CENTRAL)
+    images(folder / "images", names, CENTRAL)
     rows = []
     for E in TRUE:
         pose = np.column_stack([E[:3, :3] @ LLFF_FROM_OPENCV.T, E[:3, 3], (SIZE[1], SIZE[0], CENTRAL[0, 0])])
@@ -40,7 +40,7 @@ def llff(folder: Path) -> Twin:
 
 def neus(folder: Path) -> Twin:
     """Projections that were multiplied by a number each, of a scene that is scaled to a sphere."""
-    pictures(folder / "image", [f"{i:03d}.png" for i in range(4)])
+    images(folder / "image", [f"{i:03d}.png" for i in range(4)])
     matrices = {}
     for i, E in enumerate(TRUE):
         P = np.eye(4)
@@ -51,7 +51,7 @@ def neus(folder: Path) -> Twin:
 
 
 def sdfstudio(folder: Path) -> Twin:
-    pictures(folder, [f"{i:06d}_rgb.png" for i in range(4)])
+    images(folder, [f"{i:06d}_rgb.png" for i in range(4)])
     matrix = np.eye(4)
     matrix[:3, :3] = K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     frames = [
@@ -69,7 +69,7 @@ def nerfies(folder: Path) -> Twin:
     small = SIZE[0] // 2, SIZE[1] // 2
     corner = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     small_K = half @ (K + corner) - corner
-    pictures(folder / "rgb" / "2x", [f"0_{i:05d}.png" for i in range(4)], small_K, small)
+    images(folder / "rgb" / "2x", [f"0_{i:05d}.png" for i in range(4)], small_K, small)
     (folder / "camera").mkdir()
     for i, E in enumerate(TRUE):
         entries = {"orientation": E[:3, :3].T.tolist(), "position": E[:3, 3].tolist(), "skew": 0.0}
@@ -82,7 +82,7 @@ def nerfies(folder: Path) -> Twin:
 
 def nsvf(folder: Path) -> Twin:
     """Names of images and poses that only their order joins."""
-    pictures(folder / "rgb", [f"0_{i:05d}.png" for i in range(4)])
+    images(folder / "rgb", [f"0_{i:05d}.png" for i in range(4)])
     (folder / "pose").mkdir()
     for i, E in enumerate(TRUE):
         (folder / "pose" / f"1_{i:05d}.txt").write_text("\n".join(words(row) for row in E))
@@ -94,7 +94,7 @@ def nsvf(folder: Path) -> Twin:
 
 def nerf_plus_plus(folder: Path) -> Twin:
     """A split of NeRF++, with a camera of each image."""
-    pictures(folder / "rgb", [f"{i:06d}.png" for i in range(4)])
+    images(folder / "rgb", [f"{i:06d}.png" for i in range(4)])
     matrix = np.eye(4)
     matrix[:3, :3] = K
     for place, matrices in (("pose", TRUE), ("intrinsics", [matrix] * 4)):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.contracts.captures import TRUE, Twin, pictures, quaternion, words
+from tests.contracts.captures import TRUE, Twin, images, quaternion, words
 from tests.unit.capture_room import SIZE, K
 
 #: OpenMVG has one focal length.
@@ -23,7 +23,7 @@ def _pose(T: np.ndarray) -> str:
 def kapture(folder: Path) -> Twin:
     """One image has a pose of its own, the others that of the rig which the camera is part of."""
     sensors = folder / "sensors"
-    pictures(sensors / "records_data" / "walk one", [f"{i:03d}.png" for i in range(4)])
+    images(sensors / "records_data" / "walk one", [f"{i:03d}.png" for i in range(4)])
     T_camera_from_rig = np.eye(4)
     T_camera_from_rig[:3, :3] = Rotation.from_rotvec([0.02, -0.4, 0.1]).as_matrix()
     T_camera_from_rig[:3, 3] = 0.05, -0.01, 0.02
@@ -44,8 +44,8 @@ def kapture(folder: Path) -> Twin:
 
 
 def openmvg(folder: Path) -> Twin:
-    """Beside it lies the file without poses that the program begins with."""
-    pictures(folder / "images" / "set", [f"M_{i}.png" for i in range(4)], ROUND)
+    """Next to it lies the file without poses that the program begins with."""
+    images(folder / "images" / "set", [f"M_{i}.png" for i in range(4)], ROUND)
     views, poses = [], []
     for i, E in enumerate(TRUE):
         view = {"local_path": "set", "filename": f"M_{i}.png", "width": SIZE[0], "height": SIZE[1]}
@@ -68,7 +68,7 @@ def openmvg(folder: Path) -> Twin:
 
 def alicevision(folder: Path) -> Twin:
     """Numbers are text, rotations columns first, the principal point an offset from the middle."""
-    pictures(folder / "images", [f"A_{i}.png" for i in range(4)])
+    images(folder / "images", [f"A_{i}.png" for i in range(4)])
     views, poses = [], []
     for i, E in enumerate(TRUE):
         view = {"viewId": f"{i}", "poseId": f"{20 + i}", "intrinsicId": "3", "path": f"D:/set/A_{i}.png"}
@@ -89,8 +89,8 @@ def alicevision(folder: Path) -> Twin:
 
 
 def realityscan(folder: Path) -> Twin:
-    """A sidecar beside each image, its numbers as attributes and as elements."""
-    pictures(folder, [f"R_{i}.png" for i in range(4)], ROUND)
+    """A sidecar next to each image, its numbers as attributes and as elements."""
+    images(folder, [f"R_{i}.png" for i in range(4)], ROUND)
     longer = max(SIZE)
     u, v = ((ROUND[i, 2] + 0.5 - SIZE[i] / 2) / longer for i in range(2))
     for i, E in enumerate(TRUE):

@@ -12,13 +12,14 @@ import pytest
 import torch
 from PIL import Image
 
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.evaluation.baselines import Prediction
 from geodiff_plugin.evaluation.datasets import DATASETS, StereoSample, find_pairs, load
 from geodiff_plugin.evaluation.datasets.layouts import KEY_VIEWS
 from geodiff_plugin.evaluation.datasets.sample import changed_ref, depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.experiment import cell_key, score
 from geodiff_plugin.formats import as_image_01, write_pfm
-from geodiff_plugin.geometry import warp_right_to_left
+from geodiff_plugin.geometry import plane_rays, warp_right_to_left
 from tests.contracts.calibrations import SAMPLES
 
 HEIGHT, WIDTH, F, CX, CY, BASELINE = 40, 64, 50.0, 31.0, 19.5, 0.2
@@ -27,7 +28,7 @@ WRITERS = {".npy": np.save, ".npz": np.savez_compressed, ".pfm": write_pfm}
 
 
 def write(root, files):
-    """Text as it is, arrays by the suffix of their name; images unless that says otherwise."""
+    """Write text as is, and arrays by the suffix of their name, as images by default."""
     for name, content in files.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -39,7 +40,7 @@ def write(root, files):
             Image.fromarray(content).save(path)
 
 
-def picture(height=HEIGHT, width=WIDTH, *channels):
+def rgb(height=HEIGHT, width=WIDTH, *channels):
     return RNG.integers(0, 256, (height, width, *channels), dtype=np.uint8)
 
 
@@ -53,7 +54,7 @@ def with_hole(values, unknown):
 DISPARITY = np.linspace(4.0, 8.0, WIDTH)[None] + np.linspace(0.0, 1.0, HEIGHT)[:, None]
 DISPARITY = np.round(DISPARITY * 256) / 256
 DEPTH_M = F * BASELINE / DISPARITY
-LEFT, RIGHT, GREY = picture(HEIGHT, WIDTH, 3), picture(HEIGHT, WIDTH, 3), picture()
+LEFT, RIGHT, GREY = rgb(HEIGHT, WIDTH, 3), rgb(HEIGHT, WIDTH, 3), rgb()
 HIDDEN = np.broadcast_to(np.arange(WIDTH) < 4, (HEIGHT, WIDTH))
 MASK = np.where(HIDDEN, 128, 255).astype(np.uint8)
 
@@ -67,12 +68,12 @@ def kitti_calibration(prefix, numbers, cx=CX, head=""):
     return "".join(head.format(n) + f"{prefix}{n}: {F} 0 {cx} {x} 0 {F} {CY} 0 0 0 1 0\n" for n, x in rows)
 
 
-def scene_files(folder, truth, doffs):
+def scene_files(folder, ground_truth, doffs):
     calibration = (
         f"cam0=[{F} 0 {CX}; 0 {F} {CY}; 0 0 1]\ncam1=[{F} 0 {CX + doffs}; 0 {F} {CY}; 0 0 1]\n"
         f"doffs={doffs}\nbaseline={BASELINE * 1000}\nwidth={WIDTH}\nheight={HEIGHT}\nndisp=16\n"
     )
-    files = {f"{folder}/im1.png": RIGHT, truth: with_hole(DISPARITY - doffs, np.inf)}
+    files = {f"{folder}/im1.png": RIGHT, ground_truth: with_hole(DISPARITY - doffs, np.inf)}
     return files | {f"{folder}/calib.txt": calibration, f"{folder}/im0.png": LEFT}
 
 
@@ -99,7 +100,7 @@ def enlarged(values):
     return values.repeat(4, 0).repeat(4, 1)
 
 
-#: Of every set its files, the right image, the truth and its calibration first.
+#: Of every set its files, the right image, ground truth and its calibration first.
 LAYOUTS = {
     "kitti2015": {
         "training/image_3/000007_10.png": RIGHT,
@@ -116,6 +117,7 @@ LAYOUTS = {
         "data/training/image_0/000007_10.png": GREY,
     },
     "middlebury2014": scene_files("Scene-perfect", "Scene-perfect/disp0.pfm", 3.25),
+    "middlebury2021": scene_files("data/artroom1", "data/artroom1/disp0.pfm", 2.5),
     "middeval3": {
         **scene_files("MiddEval3/trainingQ/Scene", "MiddEval3/trainingQ/Scene/disp0GT.pfm", 1.5),
         "MiddEval3/trainingQ/Scene/mask0nocc.png": MASK,
@@ -148,6 +150,16 @@ LAYOUTS = {
         **{f"Barn/images/000000{view}.jpg": LEFT for view in (60, 61)},
         "Barn/pair.txt": "1\n60\n2 62 10.0 61 5.0\n",
     },
+    # Poses are camera to world, in a frame that is neither camera's; depth is in whole millimetres.
+    "scannet": {
+        "test/scene0700_00/color/000012.jpg": RIGHT,
+        "test/scene0700_00/depth/000008.png": np.rint(1000 * with_hole(DEPTH_M, 0)).astype(np.uint16),
+        "test/scene0700_00/intrinsic/intrinsic_depth.txt": f"{F} 0 {CX} 0\n0 {F} {CY} 0\n0 0 1 0\n0 0 0 1\n",
+        "test/scene0700_00/color/000008.jpg": LEFT,
+        "test/scene0700_00/pose/000008.txt": "0 0 1 5\n0 1 0 6\n-1 0 0 7\n0 0 0 1\n",
+        "test/scene0700_00/pose/000012.txt": f"0 0 1 5\n0 1 0 6\n-1 0 0 {7 - BASELINE}\n0 0 0 1\n",
+        "scannet_banet_test_pairs.txt": "scene0700_00 000008 000012\nscene0701_00 000001 000002\n",
+    },
     "folder": {
         "mine/right.png": RIGHT,
         "mine/depth.npy": with_hole(DEPTH_M, np.nan),
@@ -156,7 +168,11 @@ LAYOUTS = {
     },
 }
 
-each_dataset = pytest.mark.parametrize("name", [name for name in DATASETS if name != "synthetic"])
+#: Sets whose cameras do not depend on a file.
+FIXED = {"middlebury2001", "middlebury2003", "middlebury2005", "middlebury2006"}
+each_dataset = pytest.mark.parametrize(
+    "name", [name for name in DATASETS if name not in FIXED and name != "synthetic"]
+)
 
 
 def sample_of(root, name) -> StereoSample:
@@ -177,14 +193,15 @@ def test_sample_is_in_our_conventions_and_metric(tmp_path, name):
     np.testing.assert_allclose(sample.E[:3], np.c_[np.eye(3), [BASELINE, 0, 0]], atol=1e-9)
     known = with_hole(np.ones(size, bool), False)
     np.testing.assert_array_equal(sample.valid, known)
-    np.testing.assert_allclose(sample.depth_m, np.where(known, DEPTH_M, 0), rtol=1e-5)
+    rtol = 1e-3 if name == "scannet" else 1e-5
+    np.testing.assert_allclose(sample.depth_m, np.where(known, DEPTH_M, 0), rtol=rtol)
     if name in ("middeval3", "eth3d", "booster"):
         np.testing.assert_array_equal(sample.occluded, known & HIDDEN)
     assert name != "booster" or (sample.material == 3).all()
     cameras = sample.K_left, sample.K_right, sample.E
     raw = depth_to_disparity(np.where(known, sample.depth_m, 1), *cameras)
     doffs = sample.K_right[0, 2] - sample.K_left[0, 2]
-    np.testing.assert_allclose((raw + doffs)[known], DISPARITY[known], rtol=1e-5)
+    np.testing.assert_allclose((raw + doffs)[known], DISPARITY[known], rtol=rtol)
     np.testing.assert_allclose(disparity_to_depth(raw, *cameras)[known], sample.depth_m[known], rtol=1e-5)
 
 
@@ -212,6 +229,8 @@ def test_a_file_that_is_missing_or_damaged_is_named(tmp_path, name, which, damag
     write(tmp_path, LAYOUTS[name])
     path = tmp_path / list(LAYOUTS[name])[which]
     damage(path)
+    if name == "scannet" and damage is of_another_size:
+        return  # images follow the depth map
     for ref in find_pairs(tmp_path, [name]):  # none where what makes the folder a sample is gone
         if (which, damage) == (TRUTH, Path.unlink) and name in ("mvsnet", "folder"):
             assert not load(ref).valid.any()
@@ -220,7 +239,111 @@ def test_a_file_that_is_missing_or_damaged_is_named(tmp_path, name, which, damag
             load(ref)
 
 
-def test_sets_below_one_root_are_told_apart_and_ordered(tmp_path):
+def old_middlebury(names, height, width, grey_per_px, right_offset=0):
+    """A plane 20 px away with a strip 5 px nearer; grey values of both views, 0 in unknown rows."""
+    views, disparities = names
+    suffix = ".ppm" if views[0] == "im2" and grey_per_px == 8 else ".png"
+    left = np.full((height, width), 20.0)
+    left[:, 40:50] = 25.0
+    right = np.full((height, width), 20.0)
+    right[:, 15:25] = 25.0
+    right += right_offset
+    files = {f"{view}{suffix}": rgb(height, width, 3) for view in views}
+    for name, values in zip(disparities, (left, right), strict=True):
+        values[:3] = 0
+        files[f"{name}{'.pgm' if suffix == '.ppm' else '.png'}"] = np.rint(values * grey_per_px).astype(
+            np.uint8
+        )
+    return files
+
+
+EARLY, LATE = (("im2", "im6"), ("disp2", "disp6")), (("view1", "view5"), ("disp1", "disp5"))
+
+
+@pytest.mark.parametrize(
+    ("name", "scene", "names", "size", "grey"),
+    [
+        ("middlebury2001", "venus", EARLY, (40, 60), 8),
+        ("middlebury2003", "cones", EARLY, (40, 450), 4),
+        ("middlebury2003", "teddyF", EARLY, (40, 1800), 1),
+        ("middlebury2005", "Art", LATE, (370, 60), 3),
+        ("middlebury2006", "Aloe", LATE, (555, 60), 2),
+        ("middlebury2006", "Rocks2", LATE, (1110, 60), 1),
+    ],
+)
+def test_old_middlebury_has_the_published_cameras_or_nominal_ones(tmp_path, name, scene, names, size, grey):
+    files = old_middlebury(names, *size, grey)
+    published = names is LATE
+    write(tmp_path / "x" / scene, files | ({"dmin.txt": "270\n"} if published else {}))
+    (ref,) = find_pairs(tmp_path)
+    assert ref.label == f"{name}/{scene}"
+    sample = load(ref)
+    assert sample.rectified and sample.left.shape == (*size, 3) and sample.notes["calibration"]
+    f, baseline, offset = (3740 / grey, 0.16, 270 / grey) if published else (size[1], 0.1, 0)
+    assert sample.K_left[0, 0] == f and sample.E[0, 3] == baseline
+    assert sample.K_right[0, 2] - sample.K_left[0, 2] == pytest.approx(offset)
+    expected = np.full(size, f * baseline / (20 + offset))
+    expected[:, 40:50] = f * baseline / (25 + offset)
+    expected[:3] = 0
+    np.testing.assert_allclose(sample.depth_m, expected, rtol=1e-6)
+    # The strip hides the five pixels to the left of it, and 20 px at the border are not in the right view.
+    hidden = np.isin(np.arange(size[1]), [*range(20), *range(35, 40)])
+    np.testing.assert_array_equal(sample.occluded[3:], np.broadcast_to(hidden, (size[0] - 3, size[1])))
+    assert not sample.occluded[:3].any()
+
+
+def test_old_middlebury_names_what_is_missing_or_of_another_size(tmp_path):
+    folder = tmp_path / "Aloe"
+    write(folder, old_middlebury(LATE, 370, 60, 3))
+    with pytest.raises(FileNotFoundError, match="dmin.txt"):
+        sample_of(tmp_path, "middlebury2006")
+    write(folder, {"dmin.txt": "many\n"})
+    with pytest.raises(ValueError, match=r"dmin\.txt must be one number; got 'many'"):
+        sample_of(tmp_path, "middlebury2006")
+    (folder / "disp5.png").unlink()
+    write(folder, {"dmin.txt": "200\n"})
+    assert sample_of(tmp_path, "middlebury2006").occluded is None
+    write(folder, old_middlebury(LATE, 400, 60, 3))
+    with pytest.raises(ValueError, match=r"view1\.png must be of height 1110, 555, 370; got 400"):
+        sample_of(tmp_path, "middlebury2006")
+    write(folder, old_middlebury(LATE, 370, 60, 3) | {"disp1.png": np.ones((370, 62), np.uint8)})
+    with pytest.raises(ValueError, match=r"disp1\.png must be for 60 x 370 pixels"):
+        sample_of(tmp_path, "middlebury2006")
+    (folder / "disp1.png").unlink()  # a test scene
+    assert find_pairs(tmp_path) == []
+
+
+def test_scannet_counts_half_a_metre_to_ten_and_names_lost_frames(tmp_path):
+    write(tmp_path, LAYOUTS["scannet"])
+    base = tmp_path / "test" / "scene0700_00"
+    depth = np.full((HEIGHT, WIDTH), 2000, np.uint16)
+    depth[0, :3] = 500, 501, 10000
+    write(base, {"depth/000008.png": depth, "color/000008.jpg": rgb(2 * HEIGHT, 2 * WIDTH, 3)})
+    sample = sample_of(tmp_path, "scannet")
+    assert sample.valid[0, :4].tolist() == [False, True, False, True] and sample.left.shape == (
+        HEIGHT,
+        WIDTH,
+        3,
+    )
+    for text, words in (("-inf " * 16, "finite; got infinite"), ("1 2 3", "16 numbers")):
+        write(base, {"pose/000012.txt": text})
+        with pytest.raises(ValueError, match=f"000012.txt must be {words}"):
+            sample_of(tmp_path, "scannet")
+    write(tmp_path, {"scannet_banet_test_pairs.txt": "scene0700_00 000008\n"})
+    with pytest.raises(ValueError, match=r"scannet_banet_test_pairs\.txt must be lines of"):
+        find_pairs(tmp_path)
+
+
+def test_pixels_that_kitti_does_not_list_as_visible_are_not_known_to_be_bad(tmp_path):
+    write(tmp_path, LAYOUTS["kitti2012"])
+    sample = sample_of(tmp_path, "kitti2012")
+    assert sample.notes["noc_only"] and not sample.occluded.any()
+    write(tmp_path, LAYOUTS["kitti2015"])
+    sample = sample_of(tmp_path, "kitti2015")
+    assert not sample.notes["noc_only"] and sample.occluded is None
+
+
+def test_data_sets_below_one_root_are_distinguished_and_ordered(tmp_path):
     names = ["kitti2015", "kitti2012", "middlebury2014", "eth3d", "mvsnet"]
     for name in reversed(names):
         write(tmp_path / name, LAYOUTS[name])
@@ -231,7 +354,7 @@ def test_sets_below_one_root_are_told_apart_and_ordered(tmp_path):
         find_pairs(tmp_path, ["kitty"])
 
 
-def test_kitti2012_prefers_colour_and_all_pixels_and_says_so(tmp_path):
+def test_kitti2012_prefers_colour_and_all_pixels_and_reports_this(tmp_path):
     write(tmp_path, LAYOUTS["kitti2012"])
     assert sample_of(tmp_path, "kitti2012").notes["truth"] == "disp_noc"
     files = {
@@ -247,23 +370,23 @@ def test_kitti2012_prefers_colour_and_all_pixels_and_says_so(tmp_path):
     np.testing.assert_array_equal(sample.occluded, HIDDEN)
 
 
-def test_middleburys_test_scenes_are_left_out_and_coarse_truth_says_how_coarse(tmp_path):
+def test_middleburys_test_scenes_are_skipped_and_coarse_ground_truth_has_its_step(tmp_path):
     write(tmp_path, LAYOUTS["middeval3"])
-    truth = "MiddEval3/trainingQ/Scene/disp0GT.pfm"
-    without = {name: content for name, content in LAYOUTS["middeval3"].items() if name != truth}
+    ground_truth = "MiddEval3/trainingQ/Scene/disp0GT.pfm"
+    without = {name: content for name, content in LAYOUTS["middeval3"].items() if name != ground_truth}
     write(tmp_path, {name.replace("training", "test"): content for name, content in without.items()})
     assert [ref.label for ref in find_pairs(tmp_path)] == ["middeval3/Scene"]
     assert sample_of(tmp_path, "middeval3").notes["disparity_step_px"] == 0
-    write(tmp_path, {truth: np.round(DISPARITY)})
+    write(tmp_path, {ground_truth: np.round(DISPARITY)})
     assert sample_of(tmp_path, "middeval3").notes["disparity_step_px"] == 1
 
 
 @pytest.mark.parametrize("name", ["mvsnet", "folder"])
-def test_a_pair_without_truth_is_neither_scored_nor_perturbed(tmp_path, name):
+def test_a_pair_without_ground_truth_is_neither_scored_nor_perturbed(tmp_path, name):
     write(tmp_path, LAYOUTS[name])
     (tmp_path / list(LAYOUTS[name])[TRUTH]).unlink()
     (ref,) = find_pairs(tmp_path, [name])
-    with pytest.raises(ValueError, match=rf"the truth of {name}/.*-turn1-shift0.1 must be known"):
+    with pytest.raises(ValueError, match=rf"the ground truth of {name}/.*-turn1-shift0.1 must be known"):
         load(changed_ref(ref, "perturbed", (1.0, 0.1)))
     with pytest.raises(ValueError, match=r"got none \(no .*dep"):
         score(load(ref), Prediction(np.ones((HEIGHT, WIDTH))), None)
@@ -310,9 +433,9 @@ def test_a_folder_of_two_of_three_is_no_silent_gap_and_one_of_less_is_no_pair(tm
 
 @pytest.mark.filterwarnings("ignore:.*has no unit")
 def test_folder_takes_two_calibrations_that_go_by_the_names_of_images(tmp_path):
-    pictures = {f"{side}.jpg": np.zeros((480, 640, 3), np.uint8) for side in ("left", "right")}
+    images = {f"{side}.jpg": np.zeros((480, 640, 3), np.uint8) for side in ("left", "right")}
     colmap = zip(("calib_left.txt", "calib_right.txt"), SAMPLES["colmap"], strict=True)
-    write(tmp_path / "mine", pictures | dict(colmap))
+    write(tmp_path / "mine", images | dict(colmap))
     sample = sample_of(tmp_path, "folder")
     assert (sample.K_left[0, 0], sample.E[0, 3]) == pytest.approx((700.0, 0.5))
 
@@ -321,18 +444,19 @@ REAL = Path(os.environ.get("GEODIFF_TEST_DATA", Path(__file__).resolve().parents
 
 
 def photometric_error(sample, factor):
-    """Mean absolute difference to the left image of the right one, warped by ``factor`` times the truth."""
+    """Mean absolute difference of left image and right image, warped by ``factor`` times ground truth."""
     left, right = (as_image_01(image, "image")[None] for image in (sample.left, sample.right))
     depth_m = torch.from_numpy(np.where(sample.valid, sample.depth_m, 1) * np.float32(factor))[None, None]
-    matrices = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
-    warped = warp_right_to_left(right, depth_m, *(torch.from_numpy(m).float()[None] for m in matrices))
+    left_camera, right_camera = Camera(sample.K_left), Camera(sample.K_right)
+    rays = plane_rays(depth_m, [left_camera], [right_camera], [np.linalg.inv(sample.E)])
+    warped = warp_right_to_left(right, depth_m, rays)
     seen = warped.visible & torch.from_numpy(sample.valid)
     return ((warped.image - left).abs().mean(1, keepdim=True) * seen).sum() / seen.sum()
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="no real samples")
-def test_the_thirteen_real_pairs_are_found_and_their_truth_warps_right_to_left():
+def test_the_thirteen_real_pairs_are_found_and_their_ground_truth_warps_right_to_left():
     expected = ["kitti2015"] + ["kitti2012"] * 5 + ["middlebury2014", "eth3d"] + ["mvsnet"] * 5
     refs = find_pairs(REAL)
     assert [ref.dataset for ref in refs] == expected

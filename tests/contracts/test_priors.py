@@ -13,13 +13,13 @@ from accelerate.hooks import ModelHook, add_hook_to_module
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, disable_geometry_guidance, enable_geometry_guidance
-from geodiff_plugin.algorithm.gradients import RULES, Adam
+from geodiff_plugin.algorithm.optimizers import OPTIMIZERS, Adam
 from geodiff_plugin.priors import PRIORS, find_prior, prior_of
 from geodiff_plugin.priors.map import DepthMapPipeline
 from geodiff_plugin.scale.space import SPACES
 from tests.contracts.tiny_priors import CALL, TINY
 
-FAST = {"inner_steps": 3, "min_steps": 2, "weights": {"photometric": 1.0}}
+FAST = {"guidance_steps": 3, "min_steps": 2, "weights": {"photometric": 1.0}}
 pytestmark = pytest.mark.parametrize("key", PRIORS)
 
 
@@ -43,8 +43,8 @@ def enabled(key: str):
 
 
 def run(pipe, image, **kwargs):
-    told = CALL["map"] if isinstance(pipe, DepthMapPipeline) else {}
-    return pipe(image, output_latent=True, generator=torch.Generator().manual_seed(0), **told, **kwargs)
+    reported = CALL["map"] if isinstance(pipe, DepthMapPipeline) else {}
+    return pipe(image, output_latent=True, generator=torch.Generator().manual_seed(0), **reported, **kwargs)
 
 
 def guidance_for(pair, **kwargs):
@@ -78,7 +78,7 @@ def test_a_saved_folder_is_recognised_without_class_name(key, left, tmp_path):
     np.testing.assert_allclose(run(loaded, left).prediction, run(pipe, left).prediction, atol=1e-5)
 
 
-def test_it_says_what_guidance_must_know(key, left):
+def test_it_declares_what_guidance_needs(key, left):
     prior, pipe = prior_of(tiny(key)), tiny(key)
     assert prior.space in SPACES
     assert prior.max_steps is None or prior.max_steps >= pipe.default_denoising_steps
@@ -105,7 +105,7 @@ def test_nothing_changes_without_guidance_nor_in_a_copy(key, left):
     assert state_of(pipe) == state
 
 
-def test_latents_that_are_no_tensor_are_refused_by_name(key, left):
+def test_latents_that_are_no_tensor_are_rejected_by_name(key, left):
     with pytest.raises((TypeError, ValueError), match="latents.* must be"):
         tiny(key)(left, latents=[torch.zeros(4, 8, 8)], **CALL.get(key, {}))
 
@@ -119,16 +119,16 @@ def test_guided_call_lowers_the_loss_and_restores(key, left, textured_plane, mon
             seen.append(gradient.detach())
             return super().step(gradient, reference)
 
-    monkeypatch.setitem(RULES, "watched", Watched)
+    monkeypatch.setitem(OPTIMIZERS, "watched", Watched)
     state = state_of(tiny(key))
     with enabled(key) as pipe:
-        asked = {"gradient": "full", "rule": "watched", "step_latents": 0.02}
+        asked = {"gradient": "full", "optimizer": "watched", "lr_latents": 0.02}
         if prior.network_input is None:
             with pytest.raises(ValueError, match="gradient must be 'denoised'"):
                 run(pipe, left, guidance=guidance_for(textured_plane, **asked))
             asked["gradient"] = "denoised"
         out = run(pipe, left, guidance=guidance_for(textured_plane, **asked))
-        asked |= {"step_latents": 0.0, "step_affine": 0.0}
+        asked |= {"lr_latents": 0.0, "lr_affine": 0.0}
         still = run(pipe, left, guidance=guidance_for(textured_plane, **asked))
     assert state_of(tiny(key)) == state
     assert out.prediction.shape == (1, *textured_plane.depth_m.shape, 1)
@@ -144,7 +144,7 @@ def test_no_gradient_step_touches_other_channels(key, left, textured_plane):
         return
     with enabled(key) as pipe:
         still, guided = (
-            run(pipe, left, guidance=guidance_for(textured_plane, step_latents=rate), num_inference_steps=1)
+            run(pipe, left, guidance=guidance_for(textured_plane, lr_latents=rate), num_inference_steps=1)
             for rate in (0.0, 0.1)
         )
     moved = (guided.latent - still.latent).abs().amax((0, 2, 3))
@@ -154,9 +154,9 @@ def test_no_gradient_step_touches_other_channels(key, left, textured_plane):
 
 
 def test_an_ensemble_has_a_spread_or_one_member(key, left, textured_plane):
-    guidance = guidance_for(textured_plane, inner_steps=0, min_steps=1)
+    guidance = guidance_for(textured_plane, guidance_steps=0, min_steps=1)
     once = prior_of(tiny(key)).deterministic
-    said = pytest.warns(UserWarning, match="one member runs") if once else nullcontext()
+    said = pytest.warns(UserWarning, match="one ensemble member runs") if once else nullcontext()
     with enabled(key) as pipe, said:
         out = run(pipe, left, guidance=guidance, ensemble_size=2, output_uncertainty=True)
     assert out.scale.shape == (1, 1 if once else 2)
@@ -187,14 +187,14 @@ def test_offloaded_weights_are_there_when_they_are_needed(key, guided, left, tex
     """By model in a guided call, sequentially in a plain one."""
     if key == "ppd" and not guided:
         pytest.skip("its encoder is not called as a whole")
-    pipe, told = enable_geometry_guidance(TINY[key]()), {}
+    pipe, reported = enable_geometry_guidance(TINY[key]()), {}
     if guided:
-        told["guidance"] = guidance_for(textured_plane, inner_steps=1, min_steps=1)
-    expected = run(pipe, left, **told).prediction
+        reported["guidance"] = guidance_for(textured_plane, guidance_steps=1, min_steps=1)
+    expected = run(pipe, left, **reported).prediction
     pipe.empty_text_embedding = None  # Marigold keeps it
     for module in modules_of(pipe):
         if guided:
             add_hook_to_module(module, BroughtWhenCalled())
         else:
             cpu_offload(module, "cpu", offload_buffers=len(module._parameters) > 0)
-    assert np.array_equal(run(pipe, left, **told).prediction, expected)
+    assert np.array_equal(run(pipe, left, **reported).prediction, expected)

@@ -88,14 +88,14 @@ def make_geowizard(version: int = 1) -> GeoWizardPipeline:
     reference = geowizard_reference
     if version == 1:
         encoder = CLIPVisionModelWithProjection(CLIPVisionConfig(**reference.VISION))
-        told = {"image_encoder": encoder.eval()}
+        reported = {"image_encoder": encoder.eval()}
     else:
         text_encoder = CLIPTextModel(CLIPTextConfig(**reference.TEXT)).eval()
-        told = {"text_encoder": text_encoder, "tokenizer": make_tokenizer(string.ascii_lowercase)}
+        reported = {"text_encoder": text_encoder, "tokenizer": make_tokenizer(string.ascii_lowercase)}
     width = IMAGE_EMBEDDING if version == 1 else TEXT_PROMPT
     unet = UNet2DConditionModel(**reference.UNET, projection_class_embeddings_input_dim=width).eval()
     parts = unet, AutoencoderKL(**reference.VAE).eval(), DDIMScheduler(**reference.SCHEDULER)
-    return quiet(GeoWizardPipeline(*parts, **told, default_denoising_steps=2, **AT_64))
+    return quiet(GeoWizardPipeline(*parts, **reported, default_denoising_steps=2, **AT_64))
 
 
 def make_lotus(kind: str = "g", space: str = "disparity") -> LotusPipeline:
@@ -140,5 +140,5 @@ TINY = {
 
 _MAP = np.add.outer(np.linspace(3.0, 1.0, 21), 0.2 * np.sin(np.arange(33.0)))
 _MAP[5:9, 20:25] = np.nan
-#: What a call of a prior must be given beside the image.
+#: What a call of a prior must be given next to the image.
 CALL: dict[str, dict[str, np.ndarray]] = {"map": {"depth_map": _MAP}}

@@ -27,8 +27,8 @@ Made = tuple[t.PreTrainedModel, dict[str, Any]]
 def depth_anything(kind: str = "relative") -> Made:
     """``"relative"`` or ``"metric"``."""
     backbone = t.Dinov2Config(**DINO, **STAGES)
-    told = {"depth_estimation_type": kind, "max_depth": 20, **HEAD, **NECK}
-    model = t.DepthAnythingForDepthEstimation(t.DepthAnythingConfig(backbone_config=backbone, **told))
+    reported = {"depth_estimation_type": kind, "max_depth": 20, **HEAD, **NECK}
+    model = t.DepthAnythingForDepthEstimation(t.DepthAnythingConfig(backbone_config=backbone, **reported))
     return model, {"image_processor_type": "DPTImageProcessor", **PATCHES_OF_14}
 
 
@@ -89,8 +89,8 @@ def depth_pro() -> Made:
 def prompt_depth_anything() -> Made:
     """Takes depths to start from."""
     backbone = t.Dinov2Config(**DINO, **STAGES)
-    told = {"depth_estimation_type": "metric", **HEAD, **NECK}
-    config = t.PromptDepthAnythingConfig(backbone_config=backbone, **told)
+    reported = {"depth_estimation_type": "metric", **HEAD, **NECK}
+    config = t.PromptDepthAnythingConfig(backbone_config=backbone, **reported)
     preparation = {"image_processor_type": "PromptDepthAnythingImageProcessor", **PATCHES_OF_14}
     return t.PromptDepthAnythingForDepthEstimation(config), preparation
 

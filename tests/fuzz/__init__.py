@@ -1,1 +1,1 @@
-"""Property-based: whatever comes in, either it is understood or one sentence says why not."""
+"""Property-based tests: any input is either understood or rejected with one sentence."""

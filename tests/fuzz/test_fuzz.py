@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.config import KNOBS
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.config import PARAMETERS
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
 from geodiff_plugin.formats.captures import read_capture
 from geodiff_plugin.formats.images import warn_of_other_lens
@@ -25,7 +25,7 @@ from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.jobs.pairs import is_many
 from tests.contracts import captures, captures_of_fields, captures_of_sfm
 from tests.contracts.calibrations import SAMPLES, choice, written
-from tests.unit.test_capture_files import colmap_text, transforms
+from tests.contracts.captures_in_folders import colmap_text, transforms
 
 COMMON: dict[str, Any] = {
     "deadline": None,
@@ -123,7 +123,7 @@ def _array(shape: tuple[int, ...], kind: str, fill: float) -> np.ndarray:
 
 
 def junk() -> st.SearchStrategy[Any]:
-    """Values of every kind that an argument may be given by mistake."""
+    """Values of every kind that an argument may be given accidentally."""
     numbers = st.one_of(st.floats(), st.integers(), st.integers(-(10**40), 10**40), st.booleans())
     few = st.one_of(st.none(), numbers, st.text(max_size=5), st.binary(max_size=3), st.just(Path("x")))
     shapes = [(3, 3), (4, 4), (3, 4), (40, 48, 3), (40, 48), (5, 3), (2, 2), (0,), (1, 3, 40, 48)]
@@ -142,7 +142,7 @@ def _too_long(*_: Any) -> None:
     raise AssertionError("it took more than 20 seconds")
 
 
-def survives(call: Callable[[], Any]) -> bool:
+def is_recoverable(call: Callable[[], Any]) -> bool:
     """Whether the call understood its input; an error that is not one of our sentences is the test's."""
     signal.signal(signal.SIGALRM, _too_long)
     signal.alarm(20)
@@ -173,13 +173,13 @@ pytestmark = pytest.mark.parametrize(
 def survives_damage(size: Any, path: Path, whole: bytes, read: Callable[[Any], Any], others: Any) -> None:
     """The whole file is understood; damaged ones, with another argument drawn from ``others``, survive."""
     path.write_bytes(whole)
-    assert survives(lambda: read(None)), "the whole file must be understood"
+    assert is_recoverable(lambda: read(None)), "the whole file must be understood"
 
     @size
     @given(data=damaged(whole), other=others)
     def check(data, other):
         path.write_bytes(data)
-        survives(lambda: read(other))
+        is_recoverable(lambda: read(other))
 
     check()
 
@@ -251,12 +251,12 @@ def test_matrices(tmp_path, size):
 
 def test_arguments_of_the_guidance(size):
     names = st.sampled_from(["right", "K", "E", "points", "left_size", "weights"])
-    some = st.sampled_from([name for name in KNOBS if name != "weights"])
+    some = st.sampled_from([name for name in PARAMETERS if name != "weights"])
 
     @size
     @given(st.dictionaries(names, junk(), min_size=1, max_size=3), st.dictionaries(some, junk(), max_size=2))
-    def check(given_, knobs):
-        survives(lambda: GeometryGuidance(**GOOD | given_, **knobs))
+    def check(given_, parameters):
+        is_recoverable(lambda: GeometryGuidance(**GOOD | given_, **parameters))
 
     check()
 
@@ -265,9 +265,9 @@ def test_what_stands_for_an_image(size):
     @size
     @given(value=junk(), dtype=st.sampled_from([torch.float32, torch.bfloat16, torch.uint8, torch.bool]))
     def check(value, dtype):
-        survives(lambda: as_image_01(value, "right"))
+        is_recoverable(lambda: as_image_01(value, "right"))
         if isinstance(value, np.ndarray) and value.dtype.kind in "fui":
-            survives(lambda: as_image_01(torch.from_numpy(value.astype("f4")).to(dtype), "right"))
+            is_recoverable(lambda: as_image_01(torch.from_numpy(value.astype("f4")).to(dtype), "right"))
 
     check()
 
@@ -279,7 +279,7 @@ def test_names_of_files_and_folders(tmp_path, monkeypatch, size):
     @size
     @given(name=file_names(), reader=st.sampled_from(readers), out=st.text(min_size=1, max_size=300))
     def check(name, reader, out):
-        survives(lambda: reader(name))
-        survives(lambda: check_out(tmp_path / out.replace("\0", "0")))
+        is_recoverable(lambda: reader(name))
+        is_recoverable(lambda: check_out(tmp_path / out.replace("\0", "0")))
 
     check()

@@ -102,7 +102,7 @@ def some_points(depth: np.ndarray, K: np.ndarray, count: int = 200) -> np.ndarra
 
 
 def of_small(**options: Any) -> Callable[[Callable[..., GeometryGuidance]], Callable[..., GeometryGuidance]]:
-    """Register a call on the small pair, guided as the function says of its left, right, K, E and depth."""
+    """Register a call on the small pair, guided by what the function makes of left, right, K, E and depth."""
 
     def register(guide: Callable[..., GeometryGuidance]) -> Callable[..., GeometryGuidance]:
         def run() -> Result:
@@ -142,12 +142,12 @@ def preset_marigold_dc(left, right, K, E, depth) -> GeometryGuidance:
 
 @of_small()
 def gradient_updates(left, right, K, E, depth) -> GeometryGuidance:
-    return GeometryGuidance(right, K, E, inner_steps=3, step_latents=0.03)
+    return GeometryGuidance(right, K, E, guidance_steps=3, lr_latents=0.03)
 
 
 @of_small()
 def updates_without_correction(left, right, K, E, depth) -> GeometryGuidance:
-    return GeometryGuidance(right, K, E, correct=False, inner_steps=4)
+    return GeometryGuidance(right, K, E, fit_matches=False, guidance_steps=4)
 
 
 @of_small()
@@ -187,7 +187,7 @@ def refined_pose() -> Result:
 @case
 def estimated_pose() -> Result:
     left, right, rig, _ = pair()
-    guidance = GeometryGuidance.from_photographs(
+    guidance = GeometryGuidance.from_unposed_images(
         left, right, baseline_m=float(np.linalg.norm(rig.E[:3, 3])), K=rig.K_left
     )
     return maps_of(call(bundled_prior(), left, guidance))
@@ -225,7 +225,7 @@ def tiny_decoder() -> Result:
 @of_small()
 def exposure(left, right, K, E, depth) -> GeometryGuidance:
     dark = Image.fromarray((np.asarray(right) * 0.6 + 10).astype(np.uint8))
-    return GeometryGuidance(dark, K, E, correct=False, inner_steps=3)
+    return GeometryGuidance(dark, K, E, fit_matches=False, guidance_steps=3)
 
 
 @case

@@ -1,4 +1,4 @@
-"""Freeze the results of ``cases`` anew, and print which of them moved, and by how much.
+"""Freeze the results of ``cases`` again, and print which of them moved, and by how much.
 
     python tests/golden/make.py [--file FILE] [CASE ...]
     python tests/golden/make.py --parts
@@ -6,7 +6,7 @@
 A digest of every array is kept, and a coarse summary. The stored summaries must agree within a tolerance on
 every machine; processors round differently, so digests agree only between runs on one machine. To show that a
 change of the structure moves no bit, freeze a FILE before the change, run the same command after it, and read
-what it prints. Nothing can be recovered from either of the pictures.
+what it prints. Nothing can be recovered from either of the images.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Results that no change of the structure may move (``make.py`` freezes them anew)."""
+"""Results that no change of the structure may move (``make.py`` freezes them again)."""
 
 import json
 

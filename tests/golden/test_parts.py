@@ -1,4 +1,4 @@
-"""Numbers of the method's parts, stored (``make.py --parts`` makes them anew)."""
+"""Numbers of the method's parts, stored (``make.py --parts`` makes them again)."""
 
 import json
 

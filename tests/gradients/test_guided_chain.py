@@ -1,18 +1,20 @@
 """Finite differences through the whole chain: z_t, U-Net, z0_hat, decoder, metres, warp, L_geo."""
 
+import numpy as np
 import pytest
 import torch
 
 from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.terms import Given, Objective
+from geodiff_plugin.cameras import Camera, PosedViews, View
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.priors.marigold import MarigoldPrior
-from geodiff_plugin.scale.space import AffineState, MetricMap
-from geodiff_plugin.types import CameraView, PosedViews
+from geodiff_plugin.scale.affine import AffineState
+from geodiff_plugin.scale.space import MetricMap
 
-WEIGHTS = {"photometric": 1.0, "matches": 0.3, "points": 0.1, "prior_pull": 0.01, "anchor": 0.2}
-CONFIG = GuidanceConfig(weights=WEIGHTS, pyramid_levels=2, pull_to="zero", min_visible=0.0)
+WEIGHTS = {"photometric": 1.0, "matches": 0.3, "points": 0.1, "affine_reg": 0.01, "anchor": 0.2}
+CONFIG = GuidanceConfig(weights=WEIGHTS, pyramid_levels=2, affine_reg_target="zero", min_visible=0.0)
 GRID = (1, 1, 48, 64)
 
 
@@ -22,12 +24,12 @@ def double(x):
 
 def views_of(pair):
     """A rectified view, and one that is also below."""
-    left, right = (double(image).permute(2, 0, 1)[None] / 255 for image in (pair.left, pair.right))
-    K, T = double(pair.K)[None], torch.linalg.inv(double(pair.E))[None]
-    below = T.clone()
-    below[:, 1, 3] = -0.1
-    rights = tuple(CameraView(right, K, pose) for pose in (T, below))
-    return PosedViews(left, rights, K)
+    left, right = (double(image).permute(2, 0, 1) / 255 for image in (pair.left, pair.right))
+    camera, T = Camera(np.asarray(pair.K, np.float64), right.shape[:0:-1]), np.linalg.inv(pair.E)
+    below = T.copy()
+    below[1, 3] = -0.1
+    rights = tuple(View(right, camera, pose) for pose in (T, below))
+    return [PosedViews(View(left, camera, np.eye(4)), rights)]
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])

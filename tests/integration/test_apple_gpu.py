@@ -16,6 +16,8 @@ from geodiff_plugin import GeometryGuidance, load_prior
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from tests.tiny import guided_call, quiet
 
+pytestmark = pytest.mark.end_to_end
+
 PACKAGE = Path(geodiff_plugin.__file__).parent
 PAIR = read_demo_pair()
 #: Where float64 is asked for: cameras and poses, in tensors that are made on the CPU and stay there.
@@ -58,16 +60,16 @@ def _outermost_of_cameras(frame: Any) -> str:
 
 
 @pytest.mark.parametrize(
-    ("prior", "knobs"),
+    ("prior", "parameters"),
     [
-        ("bundled", {"inner_steps": 1, "min_steps": 2}),
-        ("bundled", {"inner_steps": 1, "min_steps": 2, "gradient": "full"}),
+        ("bundled", {"guidance_steps": 1, "min_steps": 2}),
+        ("bundled", {"guidance_steps": 1, "min_steps": 2, "gradient": "full"}),
         ("map", {}),
     ],
 )
-def test_no_operation_is_missing(prior, knobs):
+def test_no_operation_is_missing(prior, parameters):
     guidance = GeometryGuidance(
-        PAIR.right, (PAIR.rig.K_left, PAIR.rig.K_right), PAIR.rig.E, sweep_pixels=10_000, **knobs
+        PAIR.right, (PAIR.rig.K_left, PAIR.rig.K_right), PAIR.rig.E, sweep_pixels=10_000, **parameters
     )
     call = {"depth_map": torch.from_numpy(np.float32(PAIR.depth_m))} if prior == "map" else {}
     pipe = quiet(load_prior(prior))

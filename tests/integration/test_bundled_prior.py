@@ -16,10 +16,12 @@ from examples.training import data
 from examples.training.models import save_prior
 from examples.training.train import parse, run
 from geodiff_plugin.bundled import load_bundled_prior
+from geodiff_plugin.jobs.notices import silent
 from geodiff_plugin.jobs.prior import load_guided_prior
-from geodiff_plugin.jobs.telling import silent
 from geodiff_plugin.priors import BUNDLED_FOLDER, load_prior
 from tests.tiny import guided_call, quiet
+
+pytestmark = pytest.mark.end_to_end
 
 
 def test_the_folder_is_small_and_holds_no_pickle():
@@ -59,7 +61,7 @@ def test_no_bar_shows_where_the_bundled_prior_loads_and_bars_are_left_as_they_we
         if hub_is_quiet:
             disable_progress_bars()
         load_prior("bundled")
-        load_guided_prior("bundled", torch.device("cpu"), tell=silent)
+        load_guided_prior("bundled", torch.device("cpu"), notify=silent)
         assert "Loading" not in capfd.readouterr().err
         assert all(host.is_progress_bar_enabled() for host in hosts)
         assert are_progress_bars_disabled() is hub_is_quiet

@@ -1,4 +1,4 @@
-"""The ComfyUI nodes, imported beside a stub of the host and run along the workflow that ships with them."""
+"""The ComfyUI nodes, imported next to a stub of the host and run along the workflow that ships with them."""
 
 import importlib.util
 import json
@@ -12,6 +12,8 @@ import pytest
 import torch
 
 from geodiff_plugin import Rig
+
+pytestmark = pytest.mark.end_to_end
 
 PACK = Path(__file__).resolve().parents[2] / "examples" / "comfyui"
 WORKFLOW = json.loads((PACK / "workflow.json").read_text())
@@ -76,7 +78,7 @@ def inputs_of(node: type) -> dict:
     return known["required"] | known.get("optional", {})
 
 
-def test_the_nodes_say_what_the_host_asks_and_the_workflow_fits_them(pack):
+def test_the_nodes_declare_what_the_host_needs_and_the_workflow_fits_them(pack):
     assert set(pack.NODE_CLASS_MAPPINGS) == set(pack.NODE_DISPLAY_NAME_MAPPINGS)
     for node in pack.NODE_CLASS_MAPPINGS.values():
         assert callable(getattr(node, node.FUNCTION)) and node.CATEGORY
@@ -142,7 +144,7 @@ def test_files_are_those_of_the_input_folder(pack, host):
     before = node.IS_CHANGED("K.txt")
     (host.folder / "K.txt").write_text("1 0 0 0 1 0 0 0 1\n0.3\n")
     assert node.IS_CHANGED("K.txt") != before
-    with pytest.raises(ValueError, match="must lie in ComfyUI's input folder"):
+    with pytest.raises(ValueError, match="must be in ComfyUI's input folder"):
         node().read("../K.txt")
 
 

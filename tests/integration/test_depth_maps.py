@@ -12,6 +12,8 @@ from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.formats.depth import read_map, write_pfm
 from tests.tiny import guided_call, quiet
 
+pytestmark = pytest.mark.end_to_end
+
 PAIR = read_demo_pair()
 TRUTH = PAIR.depth_m.astype(np.float64)
 ROWS, COLUMNS = np.indices(TRUTH.shape)
@@ -75,7 +77,7 @@ def test_several_images_each_with_a_map_of_its_size():
         ("file.npy", "depth_map must be"),
     ],
 )
-def test_what_is_no_map_is_refused(depth_map, said):
+def test_a_non_map_is_rejected(depth_map, said):
     with pytest.raises((InputError, TypeError, ValueError), match=said):
         load_prior("map")(PAIR.left, depth_map=depth_map)
 

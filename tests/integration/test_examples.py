@@ -2,24 +2,31 @@
 
 import importlib
 import json
+import pickle
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
-from examples import network_poses, posed_photographs, proof
+from examples import learned_stereo, network_poses, posed_images, proof
+from examples.networks import psmnet
 from tests.cli.conftest import write_pair
 from tests.contracts.tiny_priors import TINY
+from tests.evaluating import write_scenes
+
+pytestmark = pytest.mark.end_to_end
 
 NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "quickstart.ipynb"
 #: Bytes of the notebook with its outputs: it is read in browsers.
-MOST_BYTES = 400_000
+MAX_BYTES = 400_000
 
 
 @pytest.fixture
@@ -64,26 +71,96 @@ def test_swap_prior(run, prior, pair):
     said = run("swap_prior", *pair, "--prior", prior, "--prior", "one-step")
     assert "marigold; licence unknown" in said and "depthmaster; licence unknown" in said
     assert said.count("from the first prior's depth") == 1
-    with Image.open("swap_prior.png") as picture:
-        assert picture.width > 3 * 300  # left image and two maps
+    with Image.open("swap_prior.png") as image:
+        assert image.width > 3 * 300  # left image and two maps
 
 
-def test_posed_photographs(run, prior):
-    said = run("posed_photographs", "--steps", 1, "--size", 64, 96, "--prior", prior)
-    assert "seen by both cameras" in said
+def test_posed_images(run, prior):
+    said = run("posed_images", "--steps", 1, "--size", 64, 96, "--prior", prior)
+    assert "visible in both views" in said
     E = np.eye(4)
     E[0, 3] = 0.3
-    left, right = posed_photographs.world_poses(E)
+    left, right = posed_images.world_poses(E)
     np.testing.assert_allclose(np.linalg.inv(left) @ right, E, atol=1e-12)
     assert not np.allclose(left, np.eye(4))
 
 
 @pytest.mark.slow
-def test_photographs_without_pose(run, prior):
+def test_unposed_images(run, prior):
     pytest.importorskip("poselib")
-    said = run("photographs_without_pose", "--steps", 1, "--prior", prior)
-    assert "inliers" in said and " m -> photographs_without_pose.npy\n" in said
-    assert (np.load("photographs_without_pose.npy") > 0).all()
+    said = run("unposed_images", "--steps", 1, "--prior", prior)
+    assert "inliers" in said and " m -> unposed_images.npy\n" in said
+    assert (np.load("unposed_images.npy") > 0).all()
+
+
+def as_seen(left, right):
+    """A network: disparity 8 px within 0.01, surer on the left."""
+    shape = left.shape[:2]
+    assert right.shape == left.shape and left.dtype == np.uint8
+    steps = np.broadcast_to(np.linspace(1, 0, shape[1]), shape)
+    return 8.0 + 0.01 * steps, steps
+
+
+def test_learned_stereo(run, prior, monkeypatch):
+    monkeypatch.setitem(sys.modules, "my_network", sys.modules[__name__])
+    write_scenes(Path("data"), "wall")
+    words = ["data", "--network", "my_network:as_seen", "--prior", prior]
+    with pytest.raises(SystemExit, match="0"):
+        run("learned_stereo", *words)
+    np.testing.assert_allclose(np.load("learned/middlebury2014_wall.npy"), 8, atol=0.011)
+    assert np.load("learned/confidence/middlebury2014_wall.npy")[0, 0] == 1
+    table = Path("geodiff-eval/table.md").read_text(encoding="utf-8")
+    (row,) = re.findall(r"^\| middlebury2014/wall \| (.*) \|$", table, re.M)[:1]
+    guided, peer, points, prior_map = (float(cell) for cell in row.split(" | "))
+    assert peer < 0.002 and points < 0.01 and prior_map < 0.01 and guided < 0.1
+    said = run("learned_stereo", *words, "--maps-only")
+    assert "0 new maps" in said and "points-map:disparity:learned" in said
+    wrong = [*words[:1], "--network", "my_network:too_small", "--out", "other", "--maps-only"]
+    with pytest.raises(ValueError, match=r"middlebury2014/wall must have shape \(48, 144\); got \(4, 5\)"):
+        run("learned_stereo", *wrong)
+    with pytest.raises(ValueError, match="MODULE:NAME or pipeline:MODEL"):
+        run("learned_stereo", "data", "--network", "my_network")
+
+
+def too_small(left, right):
+    return np.ones((4, 5))
+
+
+def test_a_stand_in_for_the_network_matches(textured_plane):
+    disparity = learned_stereo.semi_global(textured_plane.left, textured_plane.right)
+    expected = textured_plane.K[0, 0] * textured_plane.E[0, 3] / textured_plane.depth_m
+    assert np.isfinite(disparity).mean() > 0.5 and np.nanmedian(np.abs(disparity - expected)) < 0.5
+
+
+def test_models_of_stereo_matching_are_called_as_in_its_readme(monkeypatch):
+    def pipeline(task, model):
+        assert (task, model) == ("stereo-matching", "raft-stereo")
+        return lambda left, right: SimpleNamespace(
+            disparity=np.asarray(left)[..., 0] - np.asarray(right)[..., 0]
+        )
+
+    monkeypatch.setitem(sys.modules, "stereo_matching", SimpleNamespace(pipeline=pipeline))
+    network = learned_stereo.load_network("pipeline:raft-stereo", None)
+    left, right = np.full((4, 5, 3), 9, np.uint8), np.full((4, 5, 3), 2, np.uint8)
+    np.testing.assert_array_equal(network(left, right), np.full((4, 5), 7))
+
+
+@pytest.mark.slow
+def test_psmnet_reads_the_authors_checkpoint_without_executing_it(tmp_path):
+    torch.manual_seed(0)
+    network = psmnet.PSMNet()
+    state = {f"module.{name}": tensor for name, tensor in network.state_dict().items()}
+    torch.save({"state_dict": state}, tmp_path / "weights.tar")
+    predictor = psmnet.load(tmp_path / "weights.tar")
+    for name, tensor in predictor.network.state_dict().items():
+        torch.testing.assert_close(tensor, network.state_dict()[name])
+    left, right = np.random.default_rng(0).integers(0, 256, (2, 250, 260, 3), dtype=np.uint8)
+    disparity, confidence = predictor(left, right)
+    assert disparity.shape == confidence.shape == (250, 260)
+    assert (disparity >= 0).all() and disparity.max() < 192 and 0 <= confidence.min() <= confidence.max() <= 1
+    torch.save({"state_dict": state, "extra": Path("x")}, tmp_path / "code.tar")
+    with pytest.raises(pickle.UnpicklingError, match="[Ww]eights"):
+        psmnet.load(tmp_path / "code.tar")
 
 
 def test_sparse_points(run, prior, pair, textured_plane):
@@ -134,7 +211,7 @@ def test_capture_folder(run, prior):
     assert "AbsRel" in run("capture_folder", "--size", 96, 128, "--steps", 1, "--prior", prior)
 
 
-def test_the_proof_tells_what_was_run_and_what_was_not(run, textured_plane, tmp_path, monkeypatch):
+def test_the_proof_states_what_was_run_and_what_was_not(run, textured_plane, tmp_path, monkeypatch):
     pair = textured_plane
     known = np.ones(pair.depth_m.shape, bool)
     plane = proof.Pair("plane", pair.left, pair.right, (pair.K, pair.K), pair.E, pair.depth_m, known)
@@ -153,14 +230,14 @@ def test_the_proof_tells_what_was_run_and_what_was_not(run, textured_plane, tmp_
     assert [row[1] for row in rows] == keys
     assert len({row[3] for row in rows}) == 3 and all(len(row[3]) == 16 for row in rows)
     assert all(0 < float(row[5]) < 1 for row in rows) and rows[0][6] == "NYU 5.5" and rows[1][6] == "-"
-    assert "## Not on this machine" in text and "- nobody/nothing: prior must be" in text
+    assert "## Not available on this machine" in text and "- nobody/nothing: prior must be" in text
     assert "diffusers" in text and "Pairs: plane." in text
 
 
 def _said(cells) -> list[str]:
-    """What every cell of code printed and showed, pictures by their names."""
+    """What every cell of code printed and showed, images by their names."""
     outputs = [[*cell["outputs"]] for cell in cells if cell["cell_type"] == "code"]
-    return ["".join("".join(o.get("text", "picture\n")) for o in each) for each in outputs]
+    return ["".join("".join(o.get("text", "image\n")) for o in each) for each in outputs]
 
 
 def test_the_notebook_is_kept_with_outputs_that_nothing_of_one_machine_is_in():
@@ -171,16 +248,16 @@ def test_the_notebook_is_kept_with_outputs_that_nothing_of_one_machine_is_in():
     outputs = [output for cell in cells for output in cell["outputs"]]
     assert all(output.get("name", "stdout") == "stdout" for output in outputs)
     assert sum("image/jpeg" in output.get("data", {}) for output in outputs) == 3
-    assert len(text) < MOST_BYTES and "site-packages" not in text and "/tmp" not in text
+    assert len(text) < MAX_BYTES and "site-packages" not in text and "/tmp" not in text
 
 
 @pytest.mark.slow
-def test_the_notebook_still_says_what_is_kept_in_it(tmp_path):
+def test_the_notebook_still_prints_its_stored_outputs(tmp_path):
     for name in ("nbclient", "nbformat", "ipykernel"):
         pytest.importorskip(name, reason=f"{name} is not installed")
     copy = tmp_path / NOTEBOOK.name
     shutil.copy(NOTEBOOK, copy)
-    command = [sys.executable, "-m", "tests.pictures", "notebook", "--path", str(copy)]
+    command = [sys.executable, "-m", "tests.images", "notebook", "--path", str(copy)]
     root = NOTEBOOK.parents[1]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -190,5 +267,5 @@ def test_the_notebook_still_says_what_is_kept_in_it(tmp_path):
     for before, after in zip(kept, now, strict=True):  # as far as rounding of another machine allows
         numbers = ([float(n) for n in re.findall(number, said)] for said in (before, after))
         assert next(numbers) == pytest.approx(next(numbers), rel=0.05, abs=0.02), (
-            "python -m tests.pictures notebook"
+            "python -m tests.images notebook"
         )

@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from geodiff_plugin import disable_geometry_guidance, enable_geometry_guidance
-from geodiff_plugin._checks import InputError
-from geodiff_plugin._kernels import use_kernel
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin._internal.kernels import use_kernel
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.runtime import graphs
 from geodiff_plugin.runtime.graphs import GraphedForward
 from tests.tiny import guided_call, make_marigold, seeded
+
+pytestmark = pytest.mark.end_to_end
 
 
 def forwards(pipe) -> dict[str, object]:
@@ -21,18 +23,18 @@ def forwards(pipe) -> dict[str, object]:
     return {name: vars(module)["forward"] for name, module in modules.items() if "forward" in vars(module)}
 
 
-@pytest.mark.parametrize("knobs", [{}, {"inner_steps": 1}, {"gradient": "full", "inner_steps": 1}])
+@pytest.mark.parametrize("parameters", [{}, {"guidance_steps": 1}, {"gradient": "full", "guidance_steps": 1}])
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_a_guided_call_with_graphs_is_the_same_and_leaves_no_trace(textured_plane, knobs, device):
+def test_a_guided_call_with_graphs_is_the_same_and_leaves_no_trace(textured_plane, parameters, device):
     if device == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     pipe = make_marigold().to(device)
-    expected = guided_call(pipe, textured_plane, knobs, num_inference_steps=2).prediction
-    enable_geometry_guidance(pipe, graphs=True)
+    expected = guided_call(pipe, textured_plane, parameters, num_inference_steps=2).prediction
+    enable_geometry_guidance(pipe, cuda_graphs=True)
     seen = []
     handle = pipe.unet.register_forward_pre_hook(lambda *_: seen.append(len(forwards(pipe))))
     for _ in range(3):  # eager, recorded, replayed
-        found = guided_call(pipe, textured_plane, knobs, num_inference_steps=2).prediction
+        found = guided_call(pipe, textured_plane, parameters, num_inference_steps=2).prediction
         assert abs(found / expected - 1).max() < 1e-5
     handle.remove()
     assert seen[0] > 0  # they were in place
@@ -42,7 +44,7 @@ def test_a_guided_call_with_graphs_is_the_same_and_leaves_no_trace(textured_plan
 def test_a_plain_call_heeds_no_option(textured_plane):
     pipe = make_marigold()
     expected = pipe(textured_plane.left, generator=seeded()).prediction
-    enable_geometry_guidance(pipe, graphs=True, kernels=False)
+    enable_geometry_guidance(pipe, cuda_graphs=True, kernels=False)
     seen = []
     pipe.unet.register_forward_pre_hook(lambda *_: seen.append(len(forwards(pipe))))
     assert (pipe(textured_plane.left, generator=seeded()).prediction == expected).all()
@@ -50,12 +52,12 @@ def test_a_plain_call_heeds_no_option(textured_plane):
 
 
 def test_options_stay_until_they_are_changed_or_guidance_is_disabled():
-    pipe = enable_geometry_guidance(make_marigold(), graphs=True, kernels=False)
+    pipe = enable_geometry_guidance(make_marigold(), cuda_graphs=True, kernels=False)
     enable_geometry_guidance(pipe)
     assert pipe._faster is not None and not pipe._uses_kernels
-    enable_geometry_guidance(pipe, graphs=False)
+    enable_geometry_guidance(pipe, cuda_graphs=False)
     assert pipe._faster is None and not pipe._uses_kernels
-    enable_geometry_guidance(pipe, graphs=True)
+    enable_geometry_guidance(pipe, cuda_graphs=True)
     disable_geometry_guidance(pipe)
     assert not {"_faster", "_uses_kernels"} & set(vars(pipe))
 
@@ -64,12 +66,12 @@ def test_graphs_need_networks_that_stay(monkeypatch):
     pipe = make_marigold()
     pipe.unet._hf_hook = object()  # as offloading leaves one
     with pytest.raises(InputError, match="offloading"):
-        enable_geometry_guidance(pipe, graphs=True)
+        enable_geometry_guidance(pipe, cuda_graphs=True)
 
 
 def test_kernels_are_off_within_the_call_only(textured_plane, monkeypatch):
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    monkeypatch.setattr("geodiff_plugin._kernels.has_triton", lambda: True)
+    monkeypatch.setattr("geodiff_plugin._internal.kernels.has_triton", lambda: True)
     pipe, seen = enable_geometry_guidance(make_marigold(), kernels=False), []
     pipe.unet.register_forward_pre_hook(lambda *_: seen.append(use_kernel(torch.zeros(1))))
     guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E)

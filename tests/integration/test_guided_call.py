@@ -24,14 +24,16 @@ from geodiff_plugin import (
     disable_geometry_guidance,
     enable_geometry_guidance,
 )
-from geodiff_plugin.algorithm.gradients import RULES
+from geodiff_plugin.algorithm.optimizers import OPTIMIZERS
 from geodiff_plugin.algorithm.terms import TERMS, Term
 from geodiff_plugin.config import GuidanceConfig, UpdatePlan
 from geodiff_plugin.runtime.run import GuidedRun
 from tests.contracts.tiny_priors import make_e2e_ft
 from tests.tiny import SCHEDULER, guided_call, quiet, seeded
 
-FAST = {"inner_steps": 2, "min_steps": 1, "sweep_pixels": 64 * 48}
+pytestmark = pytest.mark.end_to_end
+
+FAST = {"guidance_steps": 2, "min_steps": 1, "sweep_pixels": 64 * 48}
 PHOTOMETRIC = {"photometric": 1.0}  # alone: matches would also correct the map
 FULL = {"gradient": "full"}
 BOTH_GRADIENTS = pytest.mark.parametrize("gradient", ["denoised", "full"])
@@ -43,8 +45,8 @@ class Guided:
     def __init__(self, pipe, pair):
         self.pipe, self.pair = enable_geometry_guidance(pipe), pair
 
-    def __call__(self, knobs=None, **call):
-        return guided_call(self.pipe, self.pair, FAST | (knobs or {}), **call)
+    def __call__(self, parameters=None, **call):
+        return guided_call(self.pipe, self.pair, FAST | (parameters or {}), **call)
 
     def stock(self, **call):
         return self.pipe(self.pair.left, generator=seeded(), output_latent=True, **call)
@@ -154,7 +156,7 @@ def test_a_callback_sees_and_replaces(guided):
         values["latents"] += 0.5
 
     alone, same, moved = (
-        guided({"inner_steps": 0}, callback_on_step_end=f).prediction
+        guided({"guidance_steps": 0}, callback_on_step_end=f).prediction
         for f in (None, lambda _pipe, _i, _t, values: values, add_in_place)
     )
     assert np.array_equal(same, alone) and not np.array_equal(moved, alone)
@@ -168,7 +170,7 @@ def test_what_a_callback_changes_after_the_last_step_is_in_the_result(guided):
             values["latents"] += 0.5
 
     alone, moved = (
-        guided({"inner_steps": 0}, callback_on_step_end=f).prediction for f in (None, add_at_last)
+        guided({"guidance_steps": 0}, callback_on_step_end=f).prediction for f in (None, add_at_last)
     )
     assert not np.array_equal(moved, alone)
 
@@ -176,28 +178,28 @@ def test_what_a_callback_changes_after_the_last_step_is_in_the_result(guided):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        ([1.0], "the answer of callback_on_step_end must be a dict or None"),
+        ([1.0], "the return value of callback_on_step_end must be a dict or None"),
         (
             {"latents": None},
-            "latents in the answer of callback_on_step_end must be a tensor of.*; got NoneType",
+            "latents in the return value of callback_on_step_end must be a tensor of.*; got NoneType",
         ),
         ({"latents": torch.zeros(1, 2, 24, 32)}, r"of shape \(1, 4, 24, 32\); got \(1, 2, 24, 32\)"),
         ({"latents": torch.full((1, 4, 24, 32), torch.nan)}, "must be finite; got NaN or infinity"),
     ],
 )
-def test_a_bad_answer_of_a_callback_is_told_as_such(guided, answer, message):
+def test_an_invalid_return_value_of_a_callback_is_reported(guided, answer, message):
     with pytest.raises((ValueError, TypeError), match=message):
         guided({"weights": PHOTOMETRIC}, callback_on_step_end=lambda *_: answer)
 
 
-@pytest.mark.parametrize("crisp", [True, False])
-def test_bicubic_enlargement_stays_within_the_map(make_oracle, textured_plane, crisp):
+@pytest.mark.parametrize("refine_edges", [True, False])
+def test_bicubic_enlargement_stays_within_the_map(make_oracle, textured_plane, refine_edges):
     """It overshoots at a step of depth, below 0 m from 3 m to 60 m."""
     relative = np.zeros((24, 32), np.float32)
     relative[:, 16:] = 1.0
-    knobs = {"depth_range": (3.0, 60.0), "crisp": crisp}
+    parameters = {"depth_range": (3.0, 60.0), "refine_edges": refine_edges}
     call = {"processing_resolution": 32, "resample_method_output": "bicubic"}
-    depth_m = guided_call(make_oracle(relative), textured_plane, knobs, **call).prediction
+    depth_m = guided_call(make_oracle(relative), textured_plane, parameters, **call).prediction
     assert np.isfinite(depth_m).all() and depth_m.min() > 0
 
 
@@ -222,16 +224,16 @@ def test_every_scheduler_is_guided_and_restored(make_pipeline, textured_plane, n
     guided = Guided(make_pipeline(SCHEDULERS[name]()), textured_plane)
     reference = guided.stock(num_inference_steps=3)
     gradient = "full" if list(SCHEDULERS).index(name) % 2 else "denoised"
-    out = guided({"gradient": gradient, "corrections": 3, "inner_steps": 1}, num_inference_steps=3)
+    out = guided({"gradient": gradient, "match_fits": 3, "guidance_steps": 1}, num_inference_steps=3)
     assert np.isfinite(out.prediction).all() and len(out.history) == 3
     assert_same(guided.stock(num_inference_steps=3), reference)
 
 
-def test_leading_ddim_runs_as_trailing_unless_told(make_pipeline, textured_plane):
+def test_leading_ddim_runs_as_trailing_unless_disabled(make_pipeline, textured_plane):
     guided, steps = Guided(make_pipeline(SCHEDULERS["ddim-leading"]()), textured_plane), []
     call = {"callback_on_step_end": lambda _pipe, _i, t, _values: steps.append(int(t))}
-    for knobs in ({}, {"respace": False}):
-        guided({"inner_steps": 0} | knobs, num_inference_steps=4, **call)
+    for parameters in ({}, {"trailing_spacing": False}):
+        guided({"guidance_steps": 0} | parameters, num_inference_steps=4, **call)
     assert steps == [999, 749, 499, 249, 750, 500, 250, 0]
 
 
@@ -256,7 +258,7 @@ def test_inference_mode_forbids_updates_alone(guided):
     with torch.inference_mode():
         with pytest.raises(RuntimeError, match="inference_mode"):
             guided()
-        assert np.isfinite(guided({"inner_steps": 0}, num_inference_steps=1).prediction).all()
+        assert np.isfinite(guided({"guidance_steps": 0}, num_inference_steps=1).prediction).all()
 
 
 def _sequential(pipe):
@@ -271,7 +273,7 @@ CAST = torch.bfloat16, torch.float32
 
 
 @pytest.mark.parametrize(
-    ("change", "knobs", "message"),
+    ("change", "parameters", "message"),
     [
         (_scheduled(EulerDiscreteScheduler), {}, "EulerDiscreteScheduler"),
         (_scheduled(DDIMScheduler, **SCHEDULER, thresholding=True), {}, "thresholding"),
@@ -286,13 +288,13 @@ CAST = torch.bfloat16, torch.float32
         (lambda p: p.unet.enable_layerwise_casting(*CAST), FULL, "layerwise casting"),
     ],
 )
-def test_what_cannot_be_guided_is_refused_before_anything_is_computed(
-    guided, monkeypatch, change, knobs, message
+def test_what_cannot_be_guided_is_rejected_before_anything_is_computed(
+    guided, monkeypatch, change, parameters, message
 ):
     monkeypatch.setattr(GeometryGuidance, "prepare", lambda *_: pytest.fail("the views were swept first"))
     change(guided.pipe)
     with pytest.raises((TypeError, ValueError), match=message):
-        guided(knobs)
+        guided(parameters)
 
 
 def test_bad_arguments_of_a_call_are_named(guided):
@@ -306,21 +308,21 @@ def test_bad_arguments_of_a_call_are_named(guided):
         enable_geometry_guidance(object())
 
 
-def test_a_subclass_that_hides_the_stock_arguments_is_refused(make_pipeline):
+def test_a_subclass_that_hides_the_stock_arguments_is_rejected(make_pipeline):
     pipe = make_pipeline()
     pipe.__class__ = type("Hides", (type(pipe),), {"__call__": lambda self, image, **kwargs: None})
-    with pytest.raises(ValueError, match=r"must name the arguments .* no output_type.*write them out"):
+    with pytest.raises(ValueError, match=r"must name the arguments .*missing: output_type.*Write them out"):
         enable_geometry_guidance(pipe)
 
 
 @pytest.mark.parametrize("prediction_type", ["depth", "disparity"])
 def test_with_an_oracle_prior_the_scale_is_found(make_oracle, textured_plane, prediction_type):
     """The denoiser knows depth up to an affine map; the right view gives the metres within 2 %."""
-    truth = textured_plane.depth_m
-    value = truth if prediction_type == "depth" else 1.0 / truth
+    ground_truth = textured_plane.depth_m
+    value = ground_truth if prediction_type == "depth" else 1.0 / ground_truth
     relative = 0.4 + 0.7 * (value - value.min()) / (value.max() - value.min())
     guided = Guided(make_oracle(relative.astype(np.float32), prediction_type), textured_plane)
-    ratio = guided({"inner_steps": 10}).prediction[0, ..., 0] / truth
+    ratio = guided({"guidance_steps": 10}).prediction[0, ..., 0] / ground_truth
     assert abs(np.median(ratio) - 1.0) < 0.02
     assert np.mean(np.abs(ratio - 1.0)) < 0.03
 
@@ -329,7 +331,7 @@ STEP = 0.02
 
 
 def constant(rate):
-    """The same step whatever the gradient says, so that a test knows where an update ends."""
+    """The same step whatever the gradient is, so that a test knows where an update ends."""
     return SimpleNamespace(step=lambda gradient, reference=None: torch.full_like(gradient, STEP))
 
 
@@ -343,10 +345,15 @@ def test_later_rounds_are_anchored_to_the_network_and_all_corrections(textured_p
         return (estimate.z0 - estimate.anchor).square().flatten(1).mean(1)
 
     monkeypatch.setitem(TERMS, "spy", Term(spy))
-    monkeypatch.setitem(RULES, "constant", constant)
+    monkeypatch.setitem(OPTIMIZERS, "constant", constant)
     monkeypatch.setattr(GuidanceConfig, "plan_updates", lambda *_args, **_kw: UpdatePlan(1, 0.0, 0.03))
-    knobs = {"rule": "constant", "inner_steps": 1, "min_steps": 3, "weights": {"matches": 1.0, "spy": 1.0}}
-    guided_call(make_e2e_ft(), textured_plane, knobs)
+    parameters = {
+        "optimizer": "constant",
+        "guidance_steps": 1,
+        "min_steps": 3,
+        "weights": {"matches": 1.0, "spy": 1.0},
+    }
+    guided_call(make_e2e_ft(), textured_plane, parameters)
     assert len(seen) == 3
     torch.testing.assert_close(seen[0][0], seen[0][1])  # the first round starts from the anchor
     for (z, anchor), (next_z, next_anchor) in zip(seen, seen[1:], strict=False):

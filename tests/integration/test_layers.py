@@ -8,6 +8,8 @@ from diffusers import DiffusionPipeline
 from geodiff_plugin import enable_geometry_guidance
 from geodiff_plugin.runtime.hooks import Layers, frozen_weights, layers_of, networks_of, weights_of
 
+pytestmark = pytest.mark.end_to_end
+
 
 def test_layers_and_weights_are_those_of_torch_each_once(pipe):
     shared = torch.nn.Linear(2, 2)

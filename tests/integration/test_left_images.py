@@ -11,12 +11,14 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, InputError
 from geodiff_plugin.evidence.inputs import left_images
 
+pytestmark = pytest.mark.end_to_end
+
 LEFT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 FLOATS = LEFT.astype(np.float32) / 255
 WITH_NAN = np.where(np.arange(64)[None, :, None] == 4, np.float32(np.nan), FLOATS)
 ALPHA = np.dstack([LEFT, np.full(LEFT.shape[:2], 7, np.uint8)])
 PALETTE = Image.fromarray(LEFT).convert("P")
-TOLD = ["image has an alpha channel; it is dropped."]
+TOLD = ["image has an alpha channel: pixels with alpha 0 are not valid."]
 
 
 @pytest.mark.parametrize(
@@ -24,7 +26,7 @@ TOLD = ["image has an alpha channel; it is dropped."]
     [
         (
             {"image": "left.png"},
-            "image must be a PIL image, a numpy array or a torch tensor; got the text 'left.png'",
+            "image must be a PIL image, a numpy array or a torch tensor; got the string 'left.png'",
         ),
         ({"image": (LEFT, LEFT)}, "image must be a PIL image.*got tuple"),
         ({"image": FLOATS.transpose(2, 0, 1)}, r"image must be .*transpose\(1, 2, 0\)"),
@@ -32,16 +34,16 @@ TOLD = ["image has an alpha channel; it is dropped."]
         ({"image": LEFT > 90}, r"got dtype bool. Convert it with astype\('uint8'\) \* 255"),
         ({"image": LEFT.astype(np.float32)}, r"image must be floats in \[0, 1\].*Divide by 255"),
         ({"image": WITH_NAN}, "image must be finite; got NaN or infinity in it. Mask or fill"),
-        ({"image": LEFT[:31]}, "image must be at least 32 pixels a side"),
+        ({"image": LEFT[:31]}, "image must be at least 32 pixels per side"),
         ({"image": []}, "image must be an image or a list of images"),
         ({"image": [FLOATS, WITH_NAN]}, r"image\[1\] must be finite"),
-        ({"image": [LEFT, LEFT[:40]]}, r"image\[1\] must be of 64x48 pixels, as image\[0\]; got 64x40"),
+        ({"image": [LEFT, LEFT[:40]]}, r"image\[1\] must be of 64x48 pixels, like image\[0\]; got 64x40"),
         ({"output_type": "pil"}, "output_type must be one of np, pt; got 'pil'"),
-        ({"generator": [torch.Generator()] * 2}, "a list of 1: one for every image.*got a list of 2"),
+        ({"generator": [torch.Generator()] * 2}, "a list of 1, one per image.*got a list of 2"),
         ({"generator": 7}, "generator must be None, a torch.Generator or a list of them; got int"),
         ({"ensemble_size": 0}, "ensemble_size must be between 1"),
         ({"batch_size": None}, "batch_size must be an integer; got NoneType"),
-        ({"num_inference_steps": "4"}, "num_inference_steps must be an integer; got the text '4'"),
+        ({"num_inference_steps": "4"}, "num_inference_steps must be an integer; got the string '4'"),
         ({"processing_resolution": -8}, "processing_resolution must be between 0"),
         ({"resample_method_input": "lanczos"}, "resample_method_input must be one of .* got 'lanczos'"),
         ({"resample_method_output": "cubic"}, "resample_method_output must be one of .* got 'cubic'"),

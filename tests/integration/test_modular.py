@@ -16,8 +16,10 @@ from examples.modular import block
 from geodiff_plugin import load_prior
 from tests.tiny import guided_call, quiet, seeded
 
+pytestmark = pytest.mark.end_to_end
+
 FOLDER = Path(block.__file__).parent
-KNOBS = {"min_steps": 3, "pose": "given"}
+PARAMETERS = {"min_steps": 3, "pose": "given"}
 AT_96 = {"processing_resolution": 96}
 
 
@@ -40,24 +42,27 @@ def assembled(blocks, prior):
 
 
 def test_blocks_without_geometry_are_the_stock_pipeline(prior, views):
-    told = AT_96 | {"image": views["image"], "num_inference_steps": 2}
-    mine = assembled(block.MarigoldBlocks(), prior)(**told, generator=seeded()).get("relative_depth")
-    np.testing.assert_array_equal(mine, prior(**told, generator=seeded()).prediction)
+    reported = AT_96 | {"image": views["image"], "num_inference_steps": 2}
+    mine = assembled(block.MarigoldBlocks(), prior)(**reported, generator=seeded()).get("relative_depth")
+    np.testing.assert_array_equal(mine, prior(**reported, generator=seeded()).prediction)
 
 
-@pytest.mark.parametrize("knobs", [{}, {"inner_steps": 2}])
-def test_blocks_with_geometry_are_the_guided_call(prior, views, textured_plane, knobs):
-    told = AT_96 | {"knobs": KNOBS | knobs, "prediction_type": prior.config.prediction_type}
-    state = assembled(block.GuidedMarigoldBlocks(), prior)(**views, **told, generator=seeded())
-    out = guided_call(quiet(load_prior("bundled")), textured_plane, KNOBS | knobs, **AT_96)
+@pytest.mark.parametrize("parameters", [{}, {"guidance_steps": 2}])
+def test_blocks_with_geometry_are_the_guided_call(prior, views, textured_plane, parameters):
+    reported = AT_96 | {
+        "parameters": PARAMETERS | parameters,
+        "prediction_type": prior.config.prediction_type,
+    }
+    state = assembled(block.GuidedMarigoldBlocks(), prior)(**views, **reported, generator=seeded())
+    out = guided_call(quiet(load_prior("bundled")), textured_plane, PARAMETERS | parameters, **AT_96)
     np.testing.assert_array_equal(state.get("depth_m"), out.prediction[0, ..., 0])
     np.testing.assert_array_equal(state.get("confidence"), out.confidence[0, ..., 0])
     assert state.get("guided_output").verdict == out.verdict
 
 
 def test_each_block_runs_alone(prior, views):
-    def run(step, **told):
-        return assembled(step, prior)(**told)
+    def run(step, **reported):
+        return assembled(step, prior)(**reported)
 
     assert run(block.TextStep()).get("prompt_embeds").shape[0] == 1
     state = run(block.ImageStep(), image=views["image"], **AT_96)
@@ -96,8 +101,8 @@ def test_the_proposed_callback_applies_to_diffusers(prior, views, tmp_path):
         return {"latents": 0.5 * tensors["latents"]}
 
     stock, plain, changed = (
-        run(views["image"], **options, generator=seeded(), **told).prediction
-        for run, told in ((prior, {}), (pipe, {}), (pipe, {"callback_on_step_end": callback}))
+        run(views["image"], **options, generator=seeded(), **reported).prediction
+        for run, reported in ((prior, {}), (pipe, {}), (pipe, {"callback_on_step_end": callback}))
     )
     np.testing.assert_array_equal(plain, stock)
     assert seen == [0, 1, 2] and not np.array_equal(changed, stock)

@@ -45,7 +45,7 @@ RAY, RAY_OF_ONE = (["--engine", "ray", "--workers", count] for count in "21")
 DONE = {"folders": folders_done, "parquet": rows_done}
 LAYOUTS = tuple(DONE)
 #: Of every process that computes. Ray's own are nice by 15, and would starve where the machine is busy; and
-#: they would end when idle, where here the next command uses them again, without importing torch anew.
+#: they would end when idle, where here the next command uses them again, without importing torch again.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0", "RAY_kill_idle_workers_interval_ms": "0"}
 #: Begins what a process of Ray that holds the prior calls itself.
 ACTOR = "ray::MapWorker"
@@ -201,7 +201,7 @@ def results(out: Path, layout: str) -> dict[Path, int]:
 
 def test_folders_are_those_of_one_process_byte_for_byte(many, cluster, tmp_path):
     out = tmp_path / "out"
-    words = [*many.words(), *RAY, "--as", "folders", "--out", str(out)]
+    words = [*many.words(), *RAY, "--format", "folders", "--out", str(out)]
     answer = call(words)
     assert answer.code == 0, answer.err
     assert contents(out) == contents(many.one) and table_of(out) == table_of(many.one)
@@ -227,8 +227,8 @@ def test_parquet_holds_the_same_depth_and_a_second_run_does_what_is_missing(few,
     made = results(out, "parquet")
     answer = call(words)
     assert answer.code == 0, answer.err
-    told = json.loads(answer.out)
-    assert (told["done"], told["there"]) == (len(missing), FEW - len(missing))
+    reported = json.loads(answer.out)
+    assert (reported["done"], reported["kept"]) == (len(missing), FEW - len(missing))
     assert made.items() <= results(out, "parquet").items()
     check_whole(out, "parquet", few)
     answer = call([*words, "--seed", "3"])
@@ -255,7 +255,7 @@ def test_broken_rows_are_rows_with_an_error_and_the_rest_is_done(few, cluster, t
     words = broken(few, tmp_path)
     one = call([*words, "--out", str(tmp_path / "one")])
     for layout in LAYOUTS:
-        answer = call([*words, *RAY_OF_ONE, "--as", layout, "--out", str(tmp_path / layout)])
+        answer = call([*words, *RAY_OF_ONE, "--format", layout, "--out", str(tmp_path / layout)])
         assert answer.code == one.code == 4, answer.err
         assert "000001: LEFT must be a whole image file" in answer.err
     assert contents(tmp_path / "folders") == contents(tmp_path / "one")
@@ -274,9 +274,9 @@ def test_broken_rows_are_rows_with_an_error_and_the_rest_is_done(few, cluster, t
     assert len(rows) == FEW and not any(row["error"] for row in rows.values())
 
 
-def test_what_holds_for_all_pairs_is_said_once_and_leaves_no_folder(few, cluster, tmp_path):
+def test_an_error_common_to_all_pairs_is_reported_once_and_leaves_no_folder(few, cluster, tmp_path):
     words = few._replace(cameras=few.cameras | {"cx": 5000.0}).words()
-    answer = call([*words, *RAY_OF_ONE, "--as", "folders", "--out", str(tmp_path / "out")])
+    answer = call([*words, *RAY_OF_ONE, "--format", "folders", "--out", str(tmp_path / "out")])
     assert answer.code == 2 and "The same holds for all 8 pairs" in answer.err, answer.err
     assert not (tmp_path / "out").exists()
 
@@ -316,7 +316,7 @@ def test_a_worker_that_is_killed_in_the_middle_costs_nothing(few, cluster, tmp_p
     with ThreadPoolExecutor(1) as beside:
         killed = beside.submit(kill)
         try:
-            answer = call([*few.words(), *RAY, "--as", layout, "--out", str(out)])
+            answer = call([*few.words(), *RAY, "--format", layout, "--out", str(out)])
         finally:
             over.set()
     assert answer.code == 0, answer.err
@@ -329,7 +329,7 @@ def test_a_driver_that_is_killed_and_started_again_does_what_is_missing(
     few, cluster, tmp_path, layout, shared
 ):
     out = tmp_path / "out"
-    words = [*few.words(), *RAY_OF_ONE, "--as", layout, "--out", str(out)]
+    words = [*few.words(), *RAY_OF_ONE, "--format", layout, "--out", str(out)]
     process = start(words, cluster if shared else None)
     begun = when(lambda: DONE[layout](out), lambda: process.poll() is None)
     left = [*actors(os.getpid()), *psutil.Process(process.pid).children(recursive=True)] if begun else []
@@ -365,7 +365,7 @@ def test_a_full_disk_ends_the_run_with_a_sentence_and_what_is_done_stays(
     few, cluster, tmp_path, layout, kilobytes
 ):
     with small_disk(tmp_path / "disk", kilobytes) as disk:
-        words = [*few.words(), *RAY_OF_ONE, "--as", layout, "--out", str(disk / "out")]
+        words = [*few.words(), *RAY_OF_ONE, "--format", layout, "--out", str(disk / "out")]
         answer = call(words)
         assert answer.code == 2 and "The disk of --out is full" in answer.err, answer.err
         before = results(disk / "out", layout)
@@ -451,3 +451,18 @@ def test_options_of_a_pair_are_those_of_a_run_without_ray(few):
 
     plain = DepthOptions(left=few.folder / "left", right=few.folder / "right", out=few.folder / "out")
     assert _alone(replace(plain, engine="ray", layout="folders", workers=2, gpus=0.5)) == plain
+
+
+def test_masks_of_many_pairs_are_those_of_one_process(few, cluster, tmp_path):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for number in range(FEW):
+        valid = np.arange(SIZE[1])[None].repeat(SIZE[0], 0) < SIZE[1] // 2 + number
+        Image.fromarray(np.uint8(255) * valid).save(masks / f"{number:06}.png")
+    words = [*few.words(), "--mask", str(masks)]
+    for name, more in (("one", []), ("ray", [*RAY, "--format", "folders"])):
+        answer = call([*words, *more, "--out", str(tmp_path / name)])
+        assert answer.code == 0, answer.err
+    assert contents(tmp_path / "ray") == contents(tmp_path / "one")
+    depth = np.load(tmp_path / "ray/000003/depth.npy")
+    assert not depth[:, SIZE[1] // 2 + 3 :].any() and (depth[:, : SIZE[1] // 2 + 3] > 0).all()

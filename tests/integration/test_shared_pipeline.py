@@ -1,4 +1,4 @@
-"""A guided call beside other calls: shared components, callbacks, replaced methods, threads."""
+"""A guided call next to other calls: shared components, callbacks, replaced methods, threads."""
 
 import copy
 import threading
@@ -15,6 +15,8 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from tests.contracts.tiny_priors import AT_64, make_lotus
 from tests.tiny import SCHEDULER, quiet, seeded
 
+pytestmark = pytest.mark.end_to_end
+
 BETAS = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
 SCHEDULERS = {
     "ddim": lambda: DDIMScheduler(**SCHEDULER),
@@ -23,14 +25,14 @@ SCHEDULERS = {
 
 
 def sharing(pipe: MarigoldDepthPipeline) -> MarigoldDepthPipeline:
-    """A stock pipeline of the same components, as users make one beside a guided one."""
-    told = {"prediction_type": "depth", "default_denoising_steps": 2, **AT_64}
-    return quiet(MarigoldDepthPipeline(**pipe.components, **told))
+    """A stock pipeline of the same components, as users make one next to a guided one."""
+    reported = {"prediction_type": "depth", "default_denoising_steps": 2, **AT_64}
+    return quiet(MarigoldDepthPipeline(**pipe.components, **reported))
 
 
-def calls_of(pipe, pair, steps=2, **knobs):
+def calls_of(pipe, pair, steps=2, **overrides):
     """A stock call and a guided one, which takes a callback; without a sweep, for the sake of time."""
-    guidance = GeometryGuidance.paper(pair.right, pair.K, pair.E, **knobs)
+    guidance = GeometryGuidance.paper(pair.right, pair.K, pair.E, **overrides)
 
     def stock(**more):
         return pipe(pair.left, generator=seeded(), num_inference_steps=steps, **more).prediction
@@ -132,10 +134,10 @@ def test_a_callback_may_wait_for_a_thread_that_calls_the_pipeline(calls):
 
 
 @pytest.mark.parametrize("guided_again", [False, True])
-def test_a_call_from_a_hook_of_the_network_is_refused(pipe, calls, guided_again):
+def test_a_call_from_a_hook_of_the_network_is_rejected(pipe, calls, guided_again):
     stock, guided = calls
     hook = pipe.unet.register_forward_hook(lambda *_: (guided if guided_again else stock)())
-    with pytest.raises(RuntimeError, match="in the middle of a guided call"):
+    with pytest.raises(RuntimeError, match="A guided call of this pipeline is in progress"):
         guided()
     hook.remove()
     assert np.isfinite(stock()).all()

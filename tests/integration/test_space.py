@@ -10,6 +10,8 @@ import pytest
 
 from tests.serving import free_port, served, write_plane
 
+pytestmark = pytest.mark.end_to_end
+
 SPACE = Path(__file__).resolve().parents[2] / "examples" / "space"
 
 
@@ -47,7 +49,7 @@ def test_it_answers_the_client(address, tmp_path):
     by_label = {entry["label"]: entry["parameter_name"] for entry in asked}
     calibration = next(name for label, name in by_label.items() if label.startswith("Calibration file"))
     given = {entry["parameter_name"]: None for entry in asked if not entry["parameter_has_default"]}
-    given |= {by_label["Left photograph"]: left, by_label["Right photograph"]: right, calibration: [K]}
+    given |= {by_label["Left image"]: left, by_label["Right image"]: right, calibration: [K]}
     answer = client.predict(**given, api_name="/estimate")
     kept = {path.name for path in (tmp_path / "server").rglob("*.npy")}
     client.close()

@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin import _threads as threads
+from geodiff_plugin._internal import threads
+
+pytestmark = pytest.mark.end_to_end
 
 #: One core, so that the tests are quick on a machine that is busy: there two threads wait for each other.
 CORES, MORE = 1, 2

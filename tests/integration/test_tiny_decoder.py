@@ -11,6 +11,8 @@ from geodiff_plugin.runtime import codec
 from geodiff_plugin.runtime.codec import PUBLISHED, _loaded
 from tests.tiny import guided_call, make_vae
 
+pytestmark = pytest.mark.end_to_end
+
 
 def tiny_folder(path, channels=4, stages=2):
     torch.manual_seed(3)
@@ -28,10 +30,10 @@ def folder(tmp_path):
 
 @pytest.fixture
 def guided(pipe, textured_plane):
-    def call(decoder="full", output_latent=False, steps=3, **knobs):
-        knobs = {"corrections": 3, "decoder": decoder} | knobs
+    def call(decoder="full", output_latent=False, steps=3, **parameters):
+        parameters = {"match_fits": 3, "decoder": decoder} | parameters
         return guided_call(
-            pipe, textured_plane, knobs, num_inference_steps=steps, output_latent=output_latent
+            pipe, textured_plane, parameters, num_inference_steps=steps, output_latent=output_latent
         )
 
     return call
@@ -39,7 +41,7 @@ def guided(pipe, textured_plane):
 
 @pytest.fixture
 def count(monkeypatch):
-    """Count from now on how often an autoencoder decodes and encodes; the function tells."""
+    """Return a function that counts how often an autoencoder has decoded and encoded."""
 
     def start(vae):
         mocks = [Mock(wraps=getattr(vae, name)) for name in ("decode", "encode")]
@@ -50,12 +52,12 @@ def count(monkeypatch):
     return start
 
 
-@pytest.mark.parametrize(("corrections", "corrected"), [(1, [4]), (3, [2, 3, 4])])
-def test_a_step_that_is_not_corrected_is_the_priors_own(pipe, guided, count, corrections, corrected):
+@pytest.mark.parametrize(("match_fits", "corrected"), [(1, [4]), (3, [2, 3, 4])])
+def test_a_step_that_is_not_corrected_is_the_priors_own(pipe, guided, count, match_fits, corrected):
     counted = count(pipe.vae)
-    assert [report.step for report in guided(steps=5, corrections=corrections).history] == corrected
+    assert [report.step for report in guided(steps=5, match_fits=match_fits).history] == corrected
     # A correction decodes once and encodes twice, the last one not at all; the stock call encodes the image.
-    assert counted() == (corrections, 1 + (corrections - 1))  # both maps of a correction as one batch
+    assert counted() == (match_fits, 1 + (match_fits - 1))  # both maps of a correction as one batch
 
 
 def test_the_result_does_not_depend_on_whether_the_latent_is_asked_for(guided):
@@ -83,18 +85,18 @@ def test_the_pipeline_is_left_as_found_by_an_error_in_the_loop(pipe, guided, fol
     assert pipe.vae is own
 
 
-def test_what_cannot_decode_is_refused(guided, tmp_path, monkeypatch):
+def test_what_cannot_decode_is_rejected(guided, tmp_path, monkeypatch):
     unreachable = Mock(
         side_effect=OSError("We couldn't connect to 'https://huggingface.co' to load the files")
     )
     (tmp_path / "empty").mkdir()
     for decoder, sentence in (
-        ("tiny", r"decoder must be 'full' with .*folder or a hub id"),
+        ("tiny", r"decoder must be 'full' with .*folder or hub id"),
         (tiny_folder(tmp_path / "flux", channels=16), r"latent \(4 channels, 2 px a cell\).*16 channels"),
         (tiny_folder(tmp_path / "deep", stages=4), r"2 px a cell\).*8 px a cell"),
-        (str(tmp_path / "nothing"), "a folder that is there, or a hub id"),
-        (str(tmp_path / "empty"), "a folder of an AutoencoderTiny"),
-        ("nobody/no-such-decoder", r"can be reached; got 'nobody/no-such-decoder' \(We couldn't connect"),
+        (str(tmp_path / "nothing"), "an existing folder, or a hub id"),
+        (str(tmp_path / "empty"), "a folder with an AutoencoderTiny"),
+        ("nobody/no-such-decoder", r"reachable; got 'nobody/no-such-decoder' \(We couldn't connect"),
         (3, "decoder"),
     ):
         if decoder == "nobody/no-such-decoder":

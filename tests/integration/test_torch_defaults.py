@@ -9,19 +9,21 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.runtime.hooks import images_in_float32
-from geodiff_plugin.types import CameraView, PosedViews
 from tests.contracts.tiny_priors import TINY, make_e2e_ft
 from tests.scenes import render_pair
 from tests.tiny import checked_views, guided_call, plane_pair
+from tests.views import posed_of
+
+pytestmark = pytest.mark.end_to_end
 
 DEFAULTS = ("meta", torch.float64, torch.bfloat16)
-WEIGHTS = {"photometric": 1.0, "prior_pull": 0.01, "anchor": 0.1}
-PAPER = {"search": "one-number", "inner_steps": 2, "weights": WEIGHTS, "z_test": True}
+WEIGHTS = {"photometric": 1.0, "affine_reg": 0.01, "anchor": 0.1}
+PAPER = {"search": "one-number", "guidance_steps": 2, "weights": WEIGHTS, "occlusion_mask": True}
 
 
 @contextmanager
 def default(value):
-    """Of a device that holds nothing, whatever is made there by mistake is an error."""
+    """Of a device that holds nothing, anything allocated there is an error."""
     (torch.set_default_device if value == "meta" else torch.set_default_dtype)(value)
     try:
         yield
@@ -46,10 +48,10 @@ def test_a_guided_call_does_not_depend_on_them(key, kind):
     pair, pipe = plane_pair(rotation_y=0.05 if kind == "turned" else 0.0), TINY[key]()
     points = np.zeros_like(pair.depth_m)
     points[::7, ::5] = pair.depth_m[::7, ::5]
-    knobs = {"points": {"points": points}, "paper": PAPER}.get(kind, {})
+    parameters = {"points": {"points": points}, "paper": PAPER}.get(kind, {})
 
     def compute():
-        return guided_call(pipe, pair, {"min_steps": 2} | knobs).prediction
+        return guided_call(pipe, pair, {"min_steps": 2} | parameters).prediction
 
     unchanged(compute, DEFAULTS if kind else DEFAULTS[-1:])
 
@@ -65,8 +67,8 @@ def rendered():
 def test_an_estimated_pose_does_not_depend_on_them(rendered):
     pytest.importorskip("poselib")
     left, right, K, _ = rendered
-    told = {"baseline_m": 0.3, "K": K.numpy()}
-    unchanged(lambda: GeometryGuidance.from_photographs(left, right, **told).rigs[0].E, DEFAULTS[:2])
+    reported = {"baseline_m": 0.3, "K": K.numpy()}
+    unchanged(lambda: GeometryGuidance.from_unposed_images(left, right, **reported).rigs[0].E, DEFAULTS[:2])
 
 
 def test_a_refined_pose_does_not_depend_on_them(rendered):
@@ -75,10 +77,9 @@ def test_a_refined_pose_does_not_depend_on_them(rendered):
     E[:3, :3] = E[:3, :3] @ Rotation.from_euler("xyz", (0.8, -0.9, 0.5), degrees=True).as_matrix()
 
     def compute():
-        T = torch.from_numpy(np.linalg.inv(E)).to(torch.float32)
-        found, report = checked_views(PosedViews(left, (CameraView(right, K.float(), T),), K.float()))
+        found, report, _, _ = checked_views(posed_of(left, K, (right, K, np.linalg.inv(E))))
         assert report.status == "refined"
-        return found[0].T_right_from_left.numpy()
+        return found[0].T_right_from_left
 
     unchanged(compute, DEFAULTS[:2])
 
@@ -89,8 +90,8 @@ def test_a_handful_of_known_points_is_enough(pipe, textured_plane, count, gradie
     pair, points = textured_plane, np.zeros((48, 64), np.float32)
     at = np.random.default_rng(0).choice(48 * 64, count, replace=False)
     points.flat[at] = pair.depth_m.flat[at]
-    knobs = {"gradient": gradient, "inner_steps": 3, "correct": False, "min_steps": 2}
-    guidance = GeometryGuidance.from_points(points, pair.K, **knobs)
+    parameters = {"gradient": gradient, "guidance_steps": 3, "fit_matches": False, "min_steps": 2}
+    guidance = GeometryGuidance.from_points(points, pair.K, **parameters)
     full, half = (guided_call(pipe.to(d), pair, guidance).prediction for d in (torch.float32, torch.float16))
     assert np.isfinite(half).all()
     assert np.median(np.abs(half / full - 1)) < 0.1
@@ -106,16 +107,16 @@ def test_white_of_16_bits_is_no_overflow(pipe, textured_plane):
     assert "preprocess" not in vars(pipe.image_processor)
 
 
-def test_an_overflow_of_the_decoder_names_step_tensor_and_cure(pipe, textured_plane):
+def test_an_overflow_of_the_decoder_names_step_tensor_and_hint(pipe, textured_plane):
     pipe.to(torch.float16).vae.decoder.conv_out.weight.data.fill_(6e4)
     with pytest.raises(ValueError, match=r"decoded map of denoising step 3 .* float16.*bfloat16"):
-        guided_call(pipe, textured_plane, {"inner_steps": 1})
+        guided_call(pipe, textured_plane, {"guidance_steps": 1})
 
 
 def test_a_prior_in_float64_gives_the_same_depth(textured_plane):
     pipe = make_e2e_ft()  # it draws nothing
     expected, found = (
-        guided_call(pipe.to(dtype), textured_plane, {"inner_steps": 1}).prediction
+        guided_call(pipe.to(dtype), textured_plane, {"guidance_steps": 1}).prediction
         for dtype in (torch.float32, torch.float64)
     )
     np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -8,8 +8,10 @@ from tests.scenes import Camera, render_views, sample_scene
 from tests.scenes.cameras import intrinsics
 from tests.tiny import seeded
 
+pytestmark = pytest.mark.end_to_end
+
 SIZE = (72, 96)
-FAST = {"inner_steps": 4, "min_steps": 1, "sweep_pixels": 96 * 72}
+FAST = {"guidance_steps": 4, "min_steps": 1, "sweep_pixels": 96 * 72}
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,7 @@ def abs_rel(out, depth_m):
     return np.nanmean(np.abs(out.prediction[0, ..., 0] / np.where(np.isfinite(depth_m), depth_m, np.nan) - 1))
 
 
-def test_further_views_and_points_beside_them(run, group):
+def test_further_views_and_points_in_addition(run, group):
     views, depth_m, sparse = group
     two, twice, three = (
         run(GeometryGuidance.from_views(given, **FAST))
@@ -56,15 +58,16 @@ def test_further_views_and_points_beside_them(run, group):
 def test_points_instead_of_a_second_view_as_a_map_or_as_the_cloud_that_projects_to_it(run, group):
     (_, K, _), sparse = group[0][0], group[2]
     out = run(GeometryGuidance.from_points(sparse, K, **FAST))
-    assert out.visible is None and out.photometric_error is None and not out.warnings
+    assert out.visible is None and out.photometric_error is None and not out.findings
     assert abs_rel(out, group[1]) < 0.2
-    assert set(out.history[0].terms) == {"points", "anchor", "prior_pull"}
+    assert set(out.history[0].terms) == {"points", "anchor", "affine_reg"}
     rows, columns = sparse.nonzero()
     rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(K).T
     cloud = np.concatenate([rays * sparse[rows, columns, None], [[0.0, 0.0, -1.0]]])
     as_cloud = run(GeometryGuidance.from_points(cloud, K, **FAST))
     np.testing.assert_allclose(as_cloud.prediction, out.prediction, rtol=1e-3)
-    assert as_cloud.warnings == ["1 points outside the left image are left out: is their frame right?"]
+    outside = "1 points outside the left image are ignored. Check that they are in the left camera's frame."
+    assert as_cloud.findings == [outside]
 
 
 def test_points_of_another_size_than_the_image(run, group):

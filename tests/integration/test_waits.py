@@ -11,9 +11,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from geodiff_plugin.matching import Matches
+from geodiff_plugin.matching.matches import RELIABLE
 from geodiff_plugin.result import output
-from geodiff_plugin.scale.points import RELIABLE, reliable_matches
+from geodiff_plugin.scale.points import reliable_matches
 from tests.tiny import guided_call
+
+pytestmark = pytest.mark.end_to_end
 
 #: Operations whose result has a size, or is a number, that only the device knows.
 READ_BACK = (
@@ -45,8 +48,8 @@ class ReadBacks(TorchDispatchMode):
         return func(*args, **kwargs or {})
 
 
-@pytest.mark.parametrize("knobs", [{"inner_steps": 1}, {}, {"gradient": "full", "inner_steps": 1}])
-def test_no_step_waits(pipe, textured_plane, monkeypatch, knobs):
+@pytest.mark.parametrize("parameters", [{"guidance_steps": 1}, {}, {"gradient": "full", "guidance_steps": 1}])
+def test_no_step_waits(pipe, textured_plane, monkeypatch, parameters):
     reads, decode = ReadBacks(), type(pipe).decode_prediction
 
     def after_the_steps(self, latents):
@@ -56,7 +59,7 @@ def test_no_step_waits(pipe, textured_plane, monkeypatch, knobs):
     pipe.unet.register_forward_pre_hook(lambda *_: setattr(reads, "counts", True))
     monkeypatch.setattr(type(pipe), "decode_prediction", after_the_steps)
     with reads:
-        guided_call(pipe, textured_plane, knobs, num_inference_steps=2)
+        guided_call(pipe, textured_plane, parameters, num_inference_steps=2)
     assert set(reads.found) == ON_THE_CPU  # which shows that it counted
 
 

@@ -7,7 +7,7 @@ when it is imported. Without the variable they run on a card, and without a card
 import pytest
 import torch
 
-from geodiff_plugin._kernels import has_triton, interpreting
+from geodiff_plugin._internal.kernels import has_triton, interpreting
 
 _INTERPRETER = pytest.param("cpu", id="interpreter")
 _CARD = pytest.param("cuda", id="card", marks=pytest.mark.gpu)
@@ -28,7 +28,7 @@ def _why_not(device: str) -> str | None:
 def _language_interpreted_once():
     """The interpreter's functions stand in for the language's until the end.
 
-    It puts them there anew at every launch, and at every call of a function of a kernel, which takes it two
+    It puts them there again at every launch, and at every call of a function of a kernel, which takes it two
     fifths of its time.
     """
     if not (has_triton() and interpreting()):

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from geodiff_plugin._kernels import has_triton
+from geodiff_plugin._internal.kernels import has_triton
 
 
 @pytest.mark.skipif(not has_triton(), reason="Triton is not installed")

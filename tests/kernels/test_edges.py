@@ -5,12 +5,12 @@ import torch.nn.functional as F
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from geodiff_plugin._kernels import without_kernels
+from geodiff_plugin._internal.kernels import without_kernels
 from geodiff_plugin.algorithm.edges import sharpen_edges
 from tests.kernels.drawn import drawn
 
 #: Two sums of the same weights in another order may lie on both sides of a half: one pixel in a thousand.
-MOST_DIFFERING = 1e-3
+MAX_DIFFERING = 1e-3
 
 
 def blocks(seed: int, size: tuple[int, int], spacing: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -20,8 +20,8 @@ def blocks(seed: int, size: tuple[int, int], spacing: int) -> tuple[torch.Tensor
     inverse = F.interpolate(coarse, size, mode="nearest")
     inverse = F.avg_pool2d(F.pad(inverse, (spacing,) * 4, mode="replicate"), 2 * spacing + 1, 1)
     rough = 1.0 + 0.01 * torch.rand(inverse.shape, generator=generator)
-    picture = 2.0 * inverse + 0.2 * torch.rand(2, 3, *size, generator=generator)
-    return rough / inverse, picture.clamp(0.0, 1.0)
+    image = 2.0 * inverse + 0.2 * torch.rand(2, 3, *size, generator=generator)
+    return rough / inverse, image.clamp(0.0, 1.0)
 
 
 @drawn(2)
@@ -38,7 +38,7 @@ def test_ramps_of_two_maps(device, seed, size, spacing):
     with without_kernels():
         expected = sharpen_edges(depth_m, left_01, spacing)
     off = ((found / expected).log().abs() > 1e-5).float().mean()
-    assert off <= MOST_DIFFERING
+    assert off <= MAX_DIFFERING
 
 
 def test_many_pixels_of_the_example_are_ramps(device):

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from geodiff_plugin import _compilation
-from geodiff_plugin._compilation import Launch, compile_kernels, read_launches
-from geodiff_plugin._kernels import has_triton
+from geodiff_plugin._internal import compilation as _compilation
+from geodiff_plugin._internal.compilation import Launch, compile_kernels, read_launches
+from geodiff_plugin._internal.kernels import has_triton
 
 CUDA = torch.device("cuda")
 
@@ -40,11 +40,11 @@ class _CurrentDevice:
         _CurrentDevice.now = None
 
 
-def test_all_are_compiled_on_the_device_of_the_call_after_it_was_told(compiled, monkeypatch):
+def test_all_are_compiled_on_the_device_of_the_call_after_the_user_was_notified(compiled, monkeypatch):
     monkeypatch.setattr(_compilation, "available_cores", lambda: 1)
-    told = []
-    compile_kernels(torch.device("cuda", 1), lambda line: told.append((line, len(compiled))))
-    assert told == [("compiles on cuda:1", 0)]
+    reported = []
+    compile_kernels(torch.device("cuda", 1), lambda line: reported.append((line, len(compiled))))
+    assert reported == [("compiles on cuda:1", 0)]
     assert sorted(compiled, key=str) == sorted(
         ((launch.kernel, torch.device("cuda", 1)) for launch in read_launches()), key=str
     )

@@ -1,5 +1,7 @@
 """The kernel of the group norm against ``torch.nn.functional.group_norm``."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -24,14 +26,15 @@ TOLERANCES = {torch.float32: 2e-5, torch.float16: 4e-3, torch.bfloat16: 4e-2}
 @example(seed=0, batch=2, groups=3, channels=2, size=(23, 24), dtype=torch.bfloat16)
 @example(seed=0, batch=1, groups=1, channels=3, size=(24, 7), dtype=torch.float16)
 def test_any_size_and_number_format(device, seed, batch, groups, channels, size, dtype):
-    kernels = pytest.importorskip("geodiff_plugin.runtime.kernels")
+    kernels = pytest.importorskip("geodiff_plugin.runtime.kernels.group_norm")
     generator = torch.Generator().manual_seed(seed)
     x = 3 * torch.randn(batch, groups * channels, *size, generator=generator) + 1
     weight, bias = (torch.randn(groups * channels, generator=generator) for _ in range(2))
     x, weight, bias = (value.to(device, dtype) for value in (x, weight, bias))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "BLOCK", 128)  # so that a small group has several parts
-        found = kernels.group_norm(x, groups, weight, bias, 1e-6)
+        norm = SimpleNamespace(num_groups=groups, weight=weight, bias=bias, eps=1e-6)
+        found = kernels.group_norm(norm, pytest.fail, x)
     expected = F.group_norm(x.float(), groups, weight.float(), bias.float(), 1e-6)
     assert found.dtype == dtype
     scale = expected.abs().amax().clamp_min(1.0)

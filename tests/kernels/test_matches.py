@@ -8,12 +8,13 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin.matching import Matches, known_share, matches, reject_reflections
-from geodiff_plugin.matching.rows import HiddenStrips, with_hidden
-from geodiff_plugin.result.confidence import _grounds_on_grid
-from geodiff_plugin.result.flattening import _known_of
-from geodiff_plugin.result.indicators import _of_matches_and_depth
+from geodiff_plugin._internal.kernels import without_kernels
+from geodiff_plugin.matching import Matches, known_fraction, reflections, reject_reflections
+from geodiff_plugin.matching.matches import HalfOcclusions
+from geodiff_plugin.matching.rows import with_occluded
+from geodiff_plugin.result.confidence import _features_on_grid
+from geodiff_plugin.result.planar import _known_maps
+from geodiff_plugin.trust.match_statistics import _of_grid
 from tests.kernels.drawn import drawn
 
 SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
@@ -22,11 +23,11 @@ SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
 @pytest.fixture(scope="module", autouse=True)
 def small_tiles(device):
     """Tiles of so few rows and columns that a small grid has several down and across."""
-    from geodiff_plugin.matching import window_kernels
-    from geodiff_plugin.result import flattening_kernels, grounds_kernels
+    from geodiff_plugin.matching.kernels import windows
+    from geodiff_plugin.result.kernels import confidence, planar
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (window_kernels, flattening_kernels, grounds_kernels):
+        for module in (windows, planar, confidence):
             patch.setattr(module, "TILE", (16, 32))
         yield
 
@@ -52,10 +53,10 @@ def test_what_remains_of_reflections(device, seed, batch, size, factor):
     found = random_matches(seed, batch, size, device)
     found = Matches(found.inverse_depth, factor * found.confidence, found.plane_step)
     depth_m = 2.8 + 0.4 * torch.rand(batch, 1, *size, generator=torch.Generator().manual_seed(seed))
-    share = reject_reflections(found, depth_m.to(device))
+    fraction = reject_reflections(found, depth_m.to(device))
     with without_kernels():
         expected = reject_reflections(found, depth_m.to(device))
-    torch.testing.assert_close(share, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(fraction, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_a_reflection_is_rejected_by_the_kernel_as_well(device):
@@ -63,8 +64,8 @@ def test_a_reflection_is_rejected_by_the_kernel_as_well(device):
     inverse = torch.full((2, 1, *size), 0.3, device=device)
     inverse[1, :, 10:22, 12:27] = 0.1
     of_both = Matches(inverse, torch.full_like(inverse, 0.9), torch.full((2,), 0.01, device=device))
-    share = reject_reflections(of_both, torch.full_like(inverse, 1.0 / 0.3))
-    assert (share[0] == 1.0).all() and share[1, 0, 15, 20] == 0.0 and share[1, 0, 0, 0] == 1.0
+    fraction = reject_reflections(of_both, torch.full_like(inverse, 1.0 / 0.3))
+    assert (fraction[0] == 1.0).all() and fraction[1, 0, 15, 20] == 0.0 and fraction[1, 0, 0, 0] == 1.0
 
 
 @drawn(8)
@@ -72,17 +73,19 @@ def test_a_reflection_is_rejected_by_the_kernel_as_well(device):
 @example(seed=0, size=(31, 37), least=0.5)
 @example(seed=1, size=(4, 5), least=1.0)  # no match
 @example(seed=2, size=(1, 1), least=0.0)
+@example(seed=14, size=(1, 1), least=0.0)  # matches at infinity, none in front
+@example(seed=1, size=(2, 2), least=0.0)
 def test_numbers_of_matches(device, seed, size, least):
     found = random_matches(seed, 1, size, device)
     confidence = torch.where(found.confidence >= least, found.confidence, 0.0)
     of_image = Matches(found.inverse_depth[0], confidence[0], found.plane_step[0])
     depth_m = 2.8 + 0.4 * torch.rand(1, *size, generator=torch.Generator().manual_seed(seed))
-    numbers = _of_matches_and_depth(of_image, depth_m.to(device))
+    numbers = _of_grid(of_image, depth_m.to(device))
     with without_kernels():
-        expected = _of_matches_and_depth(of_image, depth_m.to(device))
+        expected = _of_grid(of_image, depth_m.to(device))
     assert numbers.keys() == expected.keys()
     for name, value in expected.items():
-        exactly = name in ("matched", "in_front", "off_where")
+        exactly = name in ("matched", "in_front", "compared")
         assert float(numbers[name]) == pytest.approx(
             float(value), rel=0.0 if exactly else 1e-5, abs=0.0 if exactly else 1e-6, nan_ok=True
         ), name
@@ -90,13 +93,13 @@ def test_numbers_of_matches(device, seed, size, least):
 
 def test_more_values_than_are_sorted_are_left_to_the_reference(device, monkeypatch):
     found, depth_m = random_matches(0, 1, (9, 8), device), torch.full((1, 1, 9, 8), 3.0, device=device)
-    monkeypatch.setattr(matches, "MOST_SORTED", 72)
-    monkeypatch.setattr("geodiff_plugin.result.indicators.MOST_SORTED", 36)
+    monkeypatch.setattr(reflections, "MAX_SORTED", 72)
+    monkeypatch.setattr("geodiff_plugin.trust.match_statistics.MAX_SORTED", 36)
     of_image = Matches(found.inverse_depth[0], found.confidence[0], found.plane_step[0])
     both = []
     for off in (False, True):
         with without_kernels(off):
-            numbers = _of_matches_and_depth(of_image, depth_m[0])
+            numbers = _of_grid(of_image, depth_m[0])
             both.append((reject_reflections(found, depth_m), *(float(each) for each in numbers.values())))
     assert torch.equal(both[0][0], both[1][0])
     assert all(math.isclose(one, other) for one, other in zip(both[0][1:], both[1][1:], strict=True))
@@ -125,7 +128,7 @@ def assert_same(call) -> None:
 @example(seed=0, size=(31, 37))
 def test_what_matches_know_around_them(device, seed, size):
     found = with_deviation(random_matches(seed, 2, size, device), seed)
-    assert_same(lambda: [known_share(found)])
+    assert_same(lambda: [known_fraction(found)])
 
 
 @drawn(2)
@@ -135,10 +138,10 @@ def test_strips_that_the_right_view_cannot_see(device, seed, size):
     found = with_deviation(random_matches(seed, 1, size, device), seed)
     generator = torch.Generator().manual_seed(seed + 1)
     rows = [torch.rand(1, 1, *size, generator=generator).to(device) for _ in range(2)]
-    strips = HiddenStrips(rows[0] > 0.4, rows[1])
+    strips = HalfOcclusions(rows[0] > 0.4, rows[1])
 
     def filled() -> list[torch.Tensor]:
-        kept = with_hidden(found, strips)
+        kept = with_occluded(found, strips)
         assert kept.deviation is not None
         return [kept.inverse_depth, kept.confidence, kept.deviation]
 
@@ -154,5 +157,5 @@ def test_grounds_of_a_depth_and_what_is_known_of_its_shape(device, seed, size):
     log_depth = (2.8 + 0.4 * torch.rand(1, 1, *size, generator=generator)).log().to(device)
     denoised = log_depth + 0.1 * torch.rand(1, 1, *size, generator=generator).to(device)
     good = torch.full((1, 1, 1, 1), 1.5, device=device)
-    assert_same(lambda: _grounds_on_grid(log_depth, denoised, found).unbind(1))
-    assert_same(lambda: _known_of(found, log_depth, log_depth.mean(), good))
+    assert_same(lambda: _features_on_grid(log_depth, denoised, found).unbind(1))
+    assert_same(lambda: _known_maps(found, log_depth, log_depth.mean(), good))

@@ -6,14 +6,16 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from geodiff_plugin._kernels import without_kernels
+from geodiff_plugin._internal.kernels import without_kernels
+from geodiff_plugin.cameras import PosedViews
 from geodiff_plugin.matching import aggregate, match_volume, sweep_planes
 from geodiff_plugin.matching.aggregation import jump_penalties
 from geodiff_plugin.matching.census import COST_LEVELS, grey
-from geodiff_plugin.matching.winner import NEVER, winner, winner_positions
-from geodiff_plugin.types import CameraView, PosedViews
+from geodiff_plugin.matching.constants import NEVER
+from geodiff_plugin.matching.winner import winner, winner_positions
 from tests.kernels.drawn import drawn
 from tests.tiny import render_plane
+from tests.views import posed_of
 
 SIZES = st.tuples(*(st.integers(1, most) for most in (37, 9, 11)))
 FOUR, EIGHT = [(1, 0), (0, 1)], [(1, 0), (0, 1), (1, 1), (1, -1)]
@@ -22,10 +24,11 @@ FOUR, EIGHT = [(1, 0), (0, 1)], [(1, 0), (0, 1), (1, 1), (1, -1)]
 @pytest.fixture(autouse=True)
 def large_blocks(device, monkeypatch):
     """The interpreter runs one block after the other, and takes hardly longer for a larger one."""
-    from geodiff_plugin.matching import kernels
+    from geodiff_plugin.matching.kernels import consistency, sweep
 
     if device.type == "cpu":
-        monkeypatch.setattr(kernels, "COST_BLOCK", (128, 16))
+        for module in (consistency, sweep):
+            monkeypatch.setattr(module, "COST_BLOCK", (128, 16))
 
 
 def random_volume(size: tuple[int, int, int], seed: int, device: torch.device):
@@ -75,11 +78,11 @@ def test_aggregation_equals_its_reference(device, size, seed):
 @pytest.mark.parametrize("axes", [FOUR, EIGHT, EIGHT[2:], EIGHT[3:]])
 @pytest.mark.parametrize("size", [(5, 6, 9), (33, 9, 4), (1, 3, 3), (6, 1, 5), (6, 5, 1)])
 def test_paths_in_any_direction(device, axes, size):
-    from geodiff_plugin.matching import kernels
+    from geodiff_plugin.matching.kernels.aggregation import jump_penalties, sum_paths
 
     levels, _, grey = random_volume(size, 1, device)
     penalties = jump_penalties(grey, axes)
-    found = kernels.aggregate(levels.mT.contiguous().mT, penalties, 34, axes)
+    found = sum_paths(levels.mT.contiguous().mT, penalties, 34, axes)
     expected = walked(levels.cpu().numpy().astype(int), penalties.cpu().numpy().astype(int), 34, axes)
     np.testing.assert_array_equal(found.cpu().numpy(), expected)
 
@@ -89,11 +92,14 @@ def test_paths_in_any_direction(device, axes, size):
 @example((1, 9, 11), 0)
 @example((1, 40, 31), 1)
 def test_penalties_equal_their_reference(device, size, seed):
+    from geodiff_plugin.matching.kernels import aggregation as kernels
+
     _, _, grey = random_volume(size, seed, device)
-    with without_kernels():
-        expected = jump_penalties(grey, EIGHT)
-    assert torch.equal(jump_penalties(grey, EIGHT), expected)
-    assert torch.equal(jump_penalties(grey[::2], FOUR), jump_penalties(grey[::2].contiguous(), FOUR))
+    assert torch.equal(kernels.jump_penalties(grey, EIGHT), jump_penalties(grey, EIGHT))
+    masked = torch.where(grey > 0.5, grey, torch.nan)
+    assert torch.equal(kernels.jump_penalties(masked, EIGHT), jump_penalties(masked, EIGHT))
+    by_rows, rows = kernels.jump_penalties(grey[::2], FOUR), grey[::2].contiguous()
+    assert torch.equal(by_rows, kernels.jump_penalties(rows, FOUR))
 
 
 @drawn(5)
@@ -101,18 +107,18 @@ def test_penalties_equal_their_reference(device, size, seed):
 @example((37, 9, 11), 0)
 @example((600, 3, 4), 1)
 def test_the_winner_equals_its_reference(device, size, seed):
-    from geodiff_plugin.matching import kernels
-
     levels, in_view, grey = random_volume(size, seed, device)
     total = aggregate(levels, grey)
     total[:, ::3] = total[:1, ::3]  # ties: the first plane wins
-    found, position = kernels.winner(total, levels, in_view), kernels.winner_positions(total)
-    expected = winner(total.short(), levels, in_view)
-    for name in ("position", "best", "runner_up"):
+    found, position = winner(total, levels, in_view), winner_positions(total)
+    with without_kernels():
+        expected = winner(total.short(), levels, in_view)
+        expected_position = winner_positions(total.short())
+    for name in ("position", "best", "second_best"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
     for name in ("gain", "sharpness"):
         torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-5, atol=1e-7)
-    assert torch.equal(position, winner_positions(total.short()))
+    assert torch.equal(position, expected_position)
 
 
 #: Metres of the right camera's place, and its turn to the side in radians.
@@ -124,8 +130,8 @@ POSES = {
 }
 
 
-def views_of(names, size: tuple[int, int], device: torch.device):
-    """A rendered left view, its right views under these poses, all grey, and K."""
+def views_of(names, size: tuple[int, int], device: torch.device) -> PosedViews:
+    """A rendered left view and its right views under these poses, all grey."""
     height, width = size
     K = np.array([[1.1 * width, 0, 0.49 * width], [0, 1.12 * width, 0.48 * height], [0, 0, 1]])
     surface = size, np.array([0.25, -0.35, 1.0]), 2.0, 0
@@ -134,9 +140,8 @@ def views_of(names, size: tuple[int, int], device: torch.device):
         E = np.eye(4)
         E[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
         E[:3, 3] = place
-        matrices = (torch.from_numpy(each).float() for each in (K, np.linalg.inv(E)))
-        views.append(CameraView(as_grey(render_plane(K, E, *surface)[0], device), *matrices))
-    return as_grey(left, device), views, torch.from_numpy(K).float()
+        views.append((as_grey(render_plane(K, E, *surface)[0], device), K, np.linalg.inv(E)))
+    return posed_of(as_grey(left, device), K, *views)
 
 
 def as_grey(image: np.ndarray, device: torch.device) -> torch.Tensor:
@@ -149,33 +154,33 @@ VIEWS = [(name,) for name in POSES] + [("rectified", "turned"), ("turned", "a li
 @pytest.mark.parametrize("names", VIEWS)
 @pytest.mark.parametrize(("size", "count"), [((15, 21), 35), ((9, 14), 7)])
 def test_a_sweep_equals_its_reference(device, names, size, count):
-    left, views, K = views_of(names, size, device)
+    posed = views_of(names, size, device)
     planes = torch.linspace(0.0, 1.1, count)
-    found = sweep_planes(PosedViews(left, views, K), planes)
+    found = sweep_planes(posed, planes)
     with without_kernels():
-        expected = sweep_planes(PosedViews(left, views, K), planes)
+        expected = sweep_planes(posed, planes)
     assert torch.equal(found.in_view, expected.in_view)
     assert torch.equal(found.levels, expected.levels)
     assert 0 < found.in_view.float().mean() < 1
 
 
 def test_a_large_canvas_is_interpolated_in_parts(device, monkeypatch):
-    from geodiff_plugin.matching import kernels
+    from geodiff_plugin.matching.kernels import sweep as kernels
 
-    left, views, K = views_of(("turned",), (9, 14), device)
-    whole = sweep_planes(PosedViews(left, views, K), torch.linspace(0.0, 1.1, 40))
+    posed = views_of(("turned",), (9, 14), device)
+    whole = sweep_planes(posed, torch.linspace(0.0, 1.1, 40))
     monkeypatch.setattr(kernels, "_SAMPLES_AT_ONCE", 3 * 15 * whole.aligned[0].size[1])
-    parts = sweep_planes(PosedViews(left, views, K), torch.linspace(0.0, 1.1, 40))
+    parts = sweep_planes(posed, torch.linspace(0.0, 1.1, 40))
     assert torch.equal(parts.levels, whole.levels)
 
 
 @pytest.mark.parametrize("names", [("rectified",), ("rectified", "turned")])
 def test_matches_equal_their_reference(device, names):
-    left, views, K = views_of(names, (11, 16), device)
+    posed = views_of(names, (11, 16), device)
     planes = torch.linspace(0.0, 1.1, 7)
-    found = match_volume(sweep_planes(PosedViews(left, views, K), planes))
+    found = match_volume(sweep_planes(posed, planes))
     with without_kernels():
-        expected = match_volume(sweep_planes(PosedViews(left, views, K), planes))
+        expected = match_volume(sweep_planes(posed, planes))
     torch.testing.assert_close(found.inverse_depth, expected.inverse_depth, rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(found.confidence, expected.confidence, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.deviation, expected.deviation, rtol=1e-5, atol=1e-5)
@@ -183,8 +188,6 @@ def test_matches_equal_their_reference(device, names):
 
 
 def test_few_planes_have_no_runner_up(device):
-    from geodiff_plugin.matching import kernels
-
     levels, in_view, grey = random_volume((3, 4, 5), 2, device)
     levels[1] = 0
-    assert (kernels.winner(aggregate(levels, grey), levels, in_view).runner_up == NEVER).all()
+    assert (winner(aggregate(levels, grey), levels, in_view).second_best == NEVER).all()

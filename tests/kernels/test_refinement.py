@@ -4,10 +4,11 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from geodiff_plugin._kernels import without_kernels
+from geodiff_plugin._internal.kernels import without_kernels
 from geodiff_plugin.matching import Matches
+from geodiff_plugin.scale.constants import KERNEL_FORMS
 from geodiff_plugin.scale.points import refine_to_matches
-from geodiff_plugin.scale.space import KERNEL_FORMS, SPACES
+from geodiff_plugin.scale.space import SPACES
 from tests.kernels.drawn import drawn
 
 
@@ -62,7 +63,7 @@ def test_both_ends_of_two_maps(device, seed, space, size, near):
 
 
 def test_the_true_ends_are_found(device):
-    """An oracle that shares nothing: exact matches of a known range."""
+    """An independent oracle: exact matches of a known range."""
     x, _ = random_matches(1, "depth", (30, 40), device)
     inverse = 1.0 / (1.3 + (7.0 - 1.3) * x[0])
     matches = Matches(inverse, torch.full_like(inverse, 0.9), torch.tensor(1e-3, device=device))

@@ -1,21 +1,22 @@
 """The kernels of act 3 against their references."""
 
-import math
-
+import numpy as np
 import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import BackgroundTask
-from geodiff_plugin.matching.rows import RowChecks, RowMatches
-from geodiff_plugin.result.confidence import Grounds, _photometric_error, _warped, depth_confidence
-from geodiff_plugin.result.voting import WIDE, Voters, _crispness, _enlarged, _step_shares, _voted
+from geodiff_plugin._internal.kernels import without_kernels
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.matching.rows import RowMatches
+from geodiff_plugin.result.confidence import _photometric_error, _warped, depth_confidence
+from geodiff_plugin.result.median import _edge_sharpness, _filtered, _step_fractions, _upsampled
+from geodiff_plugin.result.records import ConfidenceFeatures, Voters
 from tests.kernels.drawn import drawn
+from tests.views import view_of
 
 
 def random_voters(seed: int, size: tuple[int, int], device: torch.device) -> tuple[Voters, torch.Tensor]:
-    """Matches around a map of 2 m to 6 m, some of them wrong, and a picture."""
+    """Matches around a map of 2 m to 6 m, some of them wrong, and an image."""
     generator = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> torch.Tensor:
@@ -29,8 +30,7 @@ def random_voters(seed: int, size: tuple[int, int], device: torch.device) -> tup
     shift = px.to(device) / depth_m * (1.0 + 0.1 * rand(*size))
     gap, seen = 1.0 - matched, rand(*size) > 0.5
     maps = shift, matched, gap * ~seen, gap * seen * (rand(*size) > 0.5)
-    checks = BackgroundTask(lambda: RowChecks(math.nan, math.nan), torch.device("cpu"))
-    rows = RowMatches(*maps, torch.tensor(0.1), checks)
+    rows = RowMatches(*maps, torch.tensor(0.1))
     return Voters(depth_m, inverse_depth, confidence, rand(*size), rows, px), rand(3, *size)
 
 
@@ -46,9 +46,9 @@ def random_voters(seed: int, size: tuple[int, int], device: torch.device) -> tup
 def test_votes(device, seed, size, error, crispness):
     voters, left = random_voters(seed, size, device)
     numbers = torch.full((1, 1, 1, 1), error, device=device), torch.tensor(crispness, device=device)
-    found = _voted(voters, left, *numbers)
+    found = _filtered(voters, left, *numbers)
     with without_kernels():
-        expected = _voted(voters, left, *numbers)
+        expected = _filtered(voters, left, *numbers)
     # Where a half of the weight is reached is found by comparing sums, which rounding may decide otherwise.
     off = ((found - expected).abs() > 1e-5 * expected.abs().amax()).float().mean()
     assert off <= 5e-3 and found.isfinite().all()
@@ -71,8 +71,10 @@ def test_confidence(device, seed, batch, size, spread, prior):
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(batch, 1, *shape, generator=generator).to(device)
 
-    grounds = Grounds(rand(*size), 12.0 * rand(*size), 0.3 * rand(*size) ** 3, 0.7 * rand(*size) ** 3)
-    given = grounds, 0.1 * rand(*size) if spread else None
+    features = ConfidenceFeatures(
+        rand(*size), 12.0 * rand(*size), 0.3 * rand(*size) ** 3, 0.7 * rand(*size) ** 3
+    )
+    given = features, 0.1 * rand(*size) if spread else None
     error = {"none": None, "number": 0.6 * rand(1, 1), "map": 0.6 * rand(*size)}[prior]
     found = depth_confidence(*given, error)
     with without_kernels():
@@ -93,15 +95,15 @@ def test_a_right_image_seen_from_the_left(device, seed, size, size_right, turn):
     generator = torch.Generator().manual_seed(seed)
     depth_m = 0.3 + 4.0 * torch.rand(1, 1, *size, generator=generator)
     right = torch.rand(1, 3, *size_right, generator=generator)
-    K_left = torch.tensor([[[40.0, 0.3, 0.5 * size[1]], [0, 41.0, 0.5 * size[0]], [0, 0, 1]]])
-    K_right = torch.tensor([[[38.0, 0.1, 0.5 * size_right[1]], [0, 39.0, 0.5 * size_right[0]], [0, 0, 1]]])
-    cosine, sine = torch.tensor(turn).cos(), torch.tensor(turn).sin()
-    T = torch.eye(4)[None]
-    T[0, :3, 3] = torch.tensor([-0.2, 0.05, -0.5])
-    T[0, 0, 0], T[0, 0, 2], T[0, 2, 0], T[0, 2, 2] = cosine, sine, -sine, cosine
-    found, seen = _warped(right.to(device), depth_m.to(device), K_left, K_right, T)
+    K_left = np.array([[40.0, 0.3, 0.5 * size[1]], [0, 41.0, 0.5 * size[0]], [0, 0, 1]])
+    K_right = np.array([[38.0, 0.1, 0.5 * size_right[1]], [0, 39.0, 0.5 * size_right[0]], [0, 0, 1]])
+    T = np.eye(4)
+    T[:3, 3] = -0.2, 0.05, -0.5
+    T[0, 0], T[0, 2], T[2, 0], T[2, 2] = np.cos(turn), np.sin(turn), -np.sin(turn), np.cos(turn)
+    given = view_of(right[0].to(device), K_right, T), depth_m.to(device), Camera(K_left, size[::-1])
+    found, seen = _warped(*given)
     with without_kernels():
-        expected, visible = _warped(right.to(device), depth_m.to(device), K_left, K_right, T)
+        expected, visible = _warped(*given)
     # Rounding moves a place in the right image by 1e-5 px or so, more where a point is near the camera.
     assert (seen != visible).float().mean() <= 2e-3
     off = ((found - expected).abs().amax(1) > 1e-3).float().mean()
@@ -115,11 +117,11 @@ def test_steps_of_a_map_and_their_crispness(device, seed, size):
     generator = torch.Generator().manual_seed(seed)
     coarse = 1.0 + 4.0 * torch.rand(1, 1, *(-(-side // 12) for side in size), generator=generator)
     depth_m = torch.nn.functional.interpolate(coarse, size, mode="bilinear")[0, 0].to(device)
-    found, crisp = _step_shares(depth_m)[WIDE:-WIDE, WIDE:-WIDE], _crispness(depth_m)
+    found, refine_edges = _step_fractions(depth_m), _edge_sharpness(depth_m)
     with without_kernels():
-        expected, expected_crisp = _step_shares(depth_m), _crispness(depth_m)
+        expected, expected_sharpness = _step_fractions(depth_m), _edge_sharpness(depth_m)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0, equal_nan=True)
-    torch.testing.assert_close(crisp, expected_crisp, rtol=1e-4, atol=0.0)
+    torch.testing.assert_close(refine_edges, expected_sharpness, rtol=1e-4, atol=0.0)
 
 
 @drawn(3)
@@ -135,9 +137,9 @@ def test_enlarged_votes(device, seed, size, larger):
     full = tuple(round(side * factor) for side, factor in zip(size, larger, strict=True))
     voted = 20.0 * torch.rand(*size, generator=generator).to(device)
     left, whole = (torch.rand(3, *each, generator=generator).to(device) for each in (size, full))
-    found = _enlarged(voted, left, whole)
+    found = _upsampled(voted, left, whole)
     with without_kernels():
-        expected = _enlarged(voted, left, whole)
+        expected = _upsampled(voted, left, whole)
     # As of the votes; and a pixel half way between two may be rounded to either.
     off = ((found - expected).abs() > 1e-5 * expected.abs().amax()).float().mean()
     assert off <= 5e-3 and found.isfinite().all()

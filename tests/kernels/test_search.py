@@ -5,10 +5,10 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from geodiff_plugin._kernels import without_kernels
+from geodiff_plugin._internal.kernels import without_kernels
 from geodiff_plugin.matching import CostVolume
 from geodiff_plugin.matching.census import COST_LEVELS
-from geodiff_plugin.scale import points, volume_search
+from geodiff_plugin.scale import constants, points, sampling, volume_search
 from geodiff_plugin.scale.points import fit_to_points
 from geodiff_plugin.scale.space import SPACES, MetricMap
 from geodiff_plugin.scale.volume_search import _best_range
@@ -19,10 +19,12 @@ from tests.kernels.test_refinement import random_matches
 @pytest.fixture(autouse=True)
 def small_grids(monkeypatch):
     """The interpreter runs one candidate after the other."""
-    monkeypatch.setattr(volume_search, "GROUPS", 37)
-    monkeypatch.setattr(volume_search, "COARSE_GRID", 7)
-    monkeypatch.setattr(volume_search, "FINE_GRIDS", (4, 3))
-    monkeypatch.setattr(points, "BASIN_CANDIDATES", 9)
+    monkeypatch.setattr(sampling, "GROUPS", 37)
+    for module in (volume_search, constants):
+        monkeypatch.setattr(module, "COARSE_GRID", 7)
+        monkeypatch.setattr(module, "FINE_GRIDS", (4, 3))
+    for module in (points, constants):
+        monkeypatch.setattr(module, "BASIN_CANDIDATES", 9)
 
 
 def random_volume(seed: int, size: tuple[int, int], planes: int, device: torch.device):

@@ -5,8 +5,9 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin.scale.space import SPACES, AffineState, MetricMap, smooth_floor
+from geodiff_plugin._internal.kernels import without_kernels
+from geodiff_plugin.scale.affine import AffineState
+from geodiff_plugin.scale.space import SPACES, MetricMap, smooth_floor
 from tests.kernels.drawn import drawn
 
 

@@ -1,4 +1,4 @@
-"""Errors at the edges of dense truth, and of the surfaces between them."""
+"""Errors at the edges of dense ground truth, and of the surfaces between them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from geodiff_plugin.evaluation.metrics import Map
 
-#: Step of log depth between neighbours that makes an edge of dense truth.
+#: Step of log depth between neighbours that makes an edge of dense ground truth.
 LOG_STEP = 0.08
 #: How near an edge counts as at it, pixels.
 NEAR_EDGE = 3
@@ -23,16 +23,20 @@ def depth_edges(depth_m: Map, valid: Map) -> Map:
     return np.isfinite(high) & np.isfinite(low) & (high - low > LOG_STEP)
 
 
-def edge_error(pred_m: Map, truth_m: Map, valid: Map) -> float:
-    """Mean relative error within ``NEAR_EDGE`` of the edges of dense truth; NaN without an edge."""
-    near = ndimage.binary_dilation(depth_edges(truth_m, valid), iterations=NEAR_EDGE) & valid
-    return float((np.abs(pred_m - truth_m)[near] / truth_m[near]).mean()) if near.any() else float("nan")
+def edge_error(pred_m: Map, ground_truth_m: Map, valid: Map) -> float:
+    """Mean relative error within ``NEAR_EDGE`` of the edges of dense ground truth; NaN without an edge."""
+    near = ndimage.binary_dilation(depth_edges(ground_truth_m, valid), iterations=NEAR_EDGE) & valid
+    return (
+        float((np.abs(pred_m - ground_truth_m)[near] / ground_truth_m[near]).mean())
+        if near.any()
+        else float("nan")
+    )
 
 
-def surface_error(pred_m: Map, truth_m: Map, valid: Map) -> float:
+def surface_error(pred_m: Map, ground_truth_m: Map, valid: Map) -> float:
     """Mean absolute error of the slope of log depth, per mille a pixel, more than 5 px from any edge."""
-    off = valid & ~ndimage.binary_dilation(depth_edges(truth_m, valid), iterations=OFF_EDGE)
-    difference = np.log(np.maximum(pred_m, 1e-6)) - np.log(np.where(valid, truth_m, 1.0))
+    off = valid & ~ndimage.binary_dilation(depth_edges(ground_truth_m, valid), iterations=OFF_EDGE)
+    difference = np.log(np.maximum(pred_m, 1e-6)) - np.log(np.where(valid, ground_truth_m, 1.0))
     whole = off[1:, 1:] & off[:-1, 1:] & off[1:, :-1]
     if not whole.any():
         return float("nan")

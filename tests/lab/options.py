@@ -1,8 +1,8 @@
-"""Options of the laboratories, declared as those of ``geodiff eval``; nothing here imports torch."""
+"""Options of the experiments, declared like the options of ``geodiff eval``; does not import torch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,11 +15,12 @@ from geodiff_plugin.evaluation.options import (
     out_folder,
     some_of,
 )
-from geodiff_plugin.options import SPACES, declare
+from geodiff_plugin.options import SPACES
+from geodiff_plugin.settings import setting
 
 
 class Strength(NamedTuple):
-    """How an emulated prior errs: mean absolute error of log depth, a blurred map, exponent of the map."""
+    """Error of an emulated prior: mean absolute error of log depth, blur, exponent of the map."""
 
     error: float
     blurred: bool = False
@@ -35,50 +36,71 @@ STRENGTHS = {
     "blur": Strength(0.01, blurred=True),
     "gamma": Strength(0.0, gamma=1.6),
 }
-STRENGTH_METHODS = ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5")
-#: How depth of a sequence is made, by the title of its row.
+STRENGTH_METHODS = ("prior-aligned", "prior-fit", "guided", "search-only", "guided:guidance_steps=5")
+#: Ways to process a sequence, and the titles of their rows.
 WAYS = {
-    "alone": "each frame alone",
-    "steady": "averaged with three before and after",
+    "alone": "independent",
+    "temporal_smoothing": "smoothed over three before and after",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class StrengthOptions(OutOptions):
-    """Priors from exact to weak."""
+    """Options of ``strength``: the effect of prior quality."""
 
     data: tuple[Path, ...] = folder_of(
-        "Folder of data sets, or a registered set; may be repeated.", default=()
+        "Folder of data sets, or the name of a registered data set; repeatable.", default=()
     )
-    limit: int | None = count_of(None, "The first N pairs alone, of each --data.")
+    limit: int | None = count_of(None, "Maximum number of pairs of each --data, from the first.")
     strengths: tuple[str, ...] = some_of(STRENGTHS)
-    space: str = declare("disparity", "Affine in disparity, depth or log.", choices=SPACES[:3])
-    follow: float = declare(0.3, "How far the prior's later answers follow their input.", low=0.0, high=1.0)
-    methods: tuple[str, ...] = listed(STRENGTH_METHODS, "Methods that use a prior, see geodiff eval list.")
-    steps: int | None = count_of(4, "Denoising steps.", high=1000)
-    resolution: int = count_of(384, "Longer side for the prior, pixels.", 64, 8192)
+    space: str = setting(
+        "disparity",
+        "Space in which the prior is affine-invariant: disparity, depth or log.",
+        choices=SPACES[:3],
+    )
+    follow: float = setting(
+        0.3, "How much the prior's later predictions follow their input, 0 to 1.", low=0.0, high=1.0
+    )
+    methods: tuple[str, ...] = listed(
+        STRENGTH_METHODS, "Methods that use a prior; geodiff eval list shows them."
+    )
+    steps: int | None = count_of(4, "Number of denoising steps.", high=1000)
+    resolution: int = count_of(384, "Longer side of the prior's input in pixels.", 64, 8192)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceOptions(EvalOptions):
-    """Sequences of a moving rig."""
+    """Options of ``sequence``: flicker between frames of a moving rig."""
 
-    scenes: int = count_of(4, "Sequences, of the seeds from 0 on.", high=10_000)
-    frames: int = count_of(6, "Frames of each.", 2, 10_000)
+    scenes: int = count_of(4, "Number of sequences, with seeds from 0.", high=10_000)
+    frames: int = count_of(6, "Number of frames per sequence.", 2, 10_000)
     size: tuple[int, int] = field(default=(192, 256))
     ways: tuple[str, ...] = some_of(WAYS)
-    steps: int | None = count_of(4, "Denoising steps of a frame alone.", high=1000)
+    steps: int | None = count_of(4, "Number of denoising steps per frame.", high=1000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfacesOptions:
+    """Options of ``surfaces``: planarity and smoothness after every stage of a call."""
+
+    data: tuple[str, ...] = setting(
+        MISSING, "Folder with planes.json, data sets or synthetic-plain:N; repeatable."
+    )
+    prior: str = setting("bundled", "Prior to guide.")
+    seed: int = setting(0, "Random seed of the noise.")
+    out: Path | None = setting(None, "Folder for one figure per pair.")
+    without: str | None = setting(None, "Stage to omit: median or planar.", choices=("median", "planar"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrustOptions(EvalOptions):
-    """Wrong calibrations, of real pairs and of rendered ones."""
+    """Options of ``trust``: wrong calibrations of real and rendered pairs."""
 
-    data: Path | None = folder_of("Folder of real pairs; none by default.")
-    limit: int | None = count_of(None, "The first N real pairs alone.")
-    rendered: int = count_of(0, "Rendered pairs.", 0, 10**6)
-    width: int = count_of(512, "Width of the rendered pairs, pixels.", 64, 8192)
+    data: Path | None = folder_of("Folder of real pairs (default: none).")
+    limit: int | None = count_of(None, "Maximum number of real pairs, from the first.")
+    rendered: int = count_of(0, "Number of rendered pairs.", 0, 10**6)
+    width: int = count_of(512, "Width of the rendered pairs in pixels.", 64, 8192)
     kinds: tuple[str, ...] = listed(
-        (), 'Comma-separated kinds; all wrong ones by default, "right" for no wrong one.'
+        (), 'Kinds of errors, separated by commas (default: all); "right" for none.'
     )
     out: Path = out_folder("geodiff-trust")

@@ -1,7 +1,7 @@
-"""Guidance of priors from exact to weak, emulated, with a chosen error (docs/reference/strength.md).
+"""Guidance with emulated priors of a chosen error (docs/appendix/strength.md).
 
 Only the network is emulated: it answers ``(1 - follow) z0* + follow z0(z_t)``, ``z0*`` the code of the
-erroneous truth, ``z0(z_t)`` what its input says, so that an edit of one step is seen by the next one.
+erroneous ground truth, ``z0(z_t)`` implied by its input, so that the next step sees an edit of one step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from diffusers.configuration_utils import register_to_config
 from scipy import ndimage
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.algorithm.denoising import output_from
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.evaluation import tables
@@ -27,7 +27,7 @@ from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Setti
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, data_of, find_pairs, load
 from geodiff_plugin.evaluation.experiment import DENSE, Experiment, Page, cell_key, in_metres, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth, filled, to_space
-from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
+from geodiff_plugin.evaluation.tables import CellOf, Table, max_of, mean_of, method_title
 from geodiff_plugin.jobs.journal import Item, Record
 from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
@@ -36,28 +36,29 @@ from tests.lab.edges import edge_error, surface_error
 from tests.lab.options import STRENGTHS, Strength, StrengthOptions
 
 NOTE = (
-    "The emulated prior's log depth is off by so much in the mean, half of it smooth and half constant over "
-    "segments of the image; blur: 1 % and a blurred map; gamma: a map to the power 1.6, which no scale and "
-    "shift makes up for. AbsRel and δ1 in metres, without alignment but for the prior with oracle; AbsRel "
-    "within 3 px of the truth's edges; error of the slope of log depth away from them, per mille a pixel."
+    "Prior error: mean absolute error of the log depth, half of it smooth and half constant over image "
+    "segments; blur: 1 % and a blurred map; gamma: a map raised to the power 1.6, which no scale and shift "
+    "can undo. AbsRel and δ1 in metres without alignment, except for the prior with oracle. At edges: AbsRel "
+    "within 3 px of ground-truth edges. Surfaces: error of the slope of log depth away from edges, per mille "
+    "per pixel."
 )
 
 COLUMNS: dict[str, CellOf] = {
-    "prior's error": lambda group: str(group[0]["strength"]),
+    "prior error": lambda group: str(group[0]["strength"]),
     "method": method_title,
     "AbsRel": mean_of("abs_rel", 4),
     "δ1": mean_of("delta1", 4),
     "at edges": mean_of("edges", 4),
     "surfaces": mean_of("surfaces", 2),
-    "worst AbsRel": most_of("abs_rel"),
+    "worst AbsRel": max_of("abs_rel"),
 }
 #: What a prior calls 0 and 1: the quantiles of Marigold's training; the rest of the map lies beyond them.
 ENDS = (0.02, 0.98)
-#: Standard deviation of the smooth half of the error, as a share of the longer side.
+#: Standard deviation of the smooth half of the error, as a fraction of the longer side.
 SMOOTH = 0.12
-#: Spacing of the segments of the other half, as a share of the longer side.
+#: Spacing of the segments of the other half, as a fraction of the longer side.
 SEGMENTS = 0.16
-#: Standard deviation of the blur, as a share of the longer side.
+#: Standard deviation of the blur, as a fraction of the longer side.
 BLUR = 0.012
 
 
@@ -117,7 +118,7 @@ class _Denoiser(ModelMixin, ConfigMixin):
         if not starts and self._noise is not None:
             implied = (z_t - level.sigma * self._noise) / level.alpha
             z0 = (1.0 - self.config.follow) * z0 + self.config.follow * implied
-        self._noise = (z_t - level.alpha * z0) / level.sigma  # what its input holds beside that
+        self._noise = (z_t - level.alpha * z0) / level.sigma  # what its input holds next to that
         return (output_from(z0, self._noise, level)[0].to(sample.dtype),)
 
 
@@ -151,9 +152,9 @@ class EmulatedPrior(PriorCache):
 def _measure(
     prior: EmulatedPrior, options: StrengthOptions, read: Any, ref: SampleRef, strength: str, name: str
 ) -> Record:
-    """Errors of one method at one strength, of a pair with dense truth, aligned where it is relative."""
+    """Measure one method at one strength on a pair with dense ground truth; relative depth is aligned."""
     sample, method = read(ref), find_method(name)
-    truth = (sample.depth_m, sample.valid)
+    ground_truth = (sample.depth_m, sample.valid)
     if sample.valid.mean() < DENSE:
         bad_value("--data", f"pairs with truth on {DENSE:.0%} of their pixels or more", sample.label)
     prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
@@ -161,17 +162,17 @@ def _measure(
         prediction = method.run(sample, method.adapted(options.settings), prior)
     except NotApplicable as reason:
         bad_value("--methods", "methods that work on every pair", f"{name}, not on {sample.label}: {reason}")
-    depth_m = in_metres(prediction, *truth)
-    scores = evaluate_depth(depth_m, *truth)
+    depth_m = in_metres(prediction, *ground_truth)
+    scores = evaluate_depth(depth_m, *ground_truth)
     kind = {"rectified": bool(sample.rectified), "rendered": sample.dataset == "synthetic"}
-    errors = {"edges": edge_error(depth_m, *truth), "surfaces": surface_error(depth_m, *truth)}
+    errors = {"edges": edge_error(depth_m, *ground_truth), "surfaces": surface_error(depth_m, *ground_truth)}
     return kind | {"abs_rel": scores["abs_rel"], "delta1": scores["delta1"]} | errors
 
 
 def against_table(title: str, records: Sequence[Record], reference: str = "guided") -> Table:
     """Paired differences in AbsRel, the reference minus every other method, at each strength."""
-    header = ("prior's error", "against", "pairs", "mean difference [95 %]", "% of its error", "pairs won")
-    note = "Negative: smaller error than the other method. An interval without 0 tells the two apart."
+    header = ("prior error", "against", "pairs", "mean difference [95 %]", "% of its error", "pairs won")
+    note = "Negative: smaller error than the other method. Significant if the interval excludes 0."
     rows = list[tuple[str, ...]]()
     for strength, of_strength in tables.grouped(records, "strength").items():
         # Every method has every pair, in one order; two pairs of two folders may have one name.
@@ -182,9 +183,9 @@ def against_table(title: str, records: Sequence[Record], reference: str = "guide
         own = errors.pop(reference, {})
         for method, other in errors.items() if own else ():
             difference = tables.paired_difference(own, other)
-            share = 100.0 * difference.value / float(np.mean(list(other.values())))
+            fraction = 100.0 * difference.value / float(np.mean(list(other.values())))
             won = f"{sum(own[i] < other[i] for i in own)} of {len(own)}"
-            cells = (str(len(own)), difference.cell(4, "+"), f"{share:+.1f}", won)
+            cells = (str(len(own)), difference.cell(4, "+"), f"{fraction:+.1f}", won)
             rows.append((str(strength), find_method(method).title, *cells))
     return Table(
         f"{title}: {find_method(reference).title} against each other method", header, tuple(rows), note
@@ -227,7 +228,7 @@ def run(name: str, options: StrengthOptions) -> Page | None:
         key = cell_key(ref, method_name, configuration, emulated)
         cells.append(Item(key, work, name=", ".join(head.values()), head=head))
 
-    said = f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
+    said = f"Emulated priors, affine in {options.space}, input weight {options.follow:g}; "
     said += f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}."
-    of_priors = Experiment("Priors from exact to weak", cells, strength_tables, lambda _: [said])
+    of_priors = Experiment("Effect of prior quality", cells, strength_tables, lambda _: [said])
     return run_experiment(name, options, of_priors)

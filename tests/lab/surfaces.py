@@ -1,8 +1,8 @@
-"""How flat planes are after every stage of a guided call, and how smooth rendered surfaces: tables, figures.
+"""Planarity of real surfaces and smoothness of rendered ones after every stage of a call: tables, figures.
 
     python -m tests.lab surfaces --data DIR --data synthetic-plain:8@640x480 --out FOLDER
 
-Data flow: real pairs with hand-marked planes, or pairs with dense truth -> stages -> tables and figures.
+Data flow: real pairs with hand-marked planes, or pairs with dense ground truth -> stages -> tables, figures.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 from unittest.mock import patch
 
 import cv2
@@ -20,48 +20,48 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import torch.nn.functional as F
-import typer
 from PIL import Image, ImageDraw
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
-from geodiff_plugin._checks import check_choice
 from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.result import finish
 from tests.lab.edges import surface_error
+from tests.lab.options import SurfacesOptions
+from tests.views import made_rig
 
-__all__ = ["STAGES", "Flatness", "Stages", "draw_stages", "flatness", "guided_stages", "main"]
+__all__ = ["STAGES", "Flatness", "Stages", "draw_stages", "flatness", "guided_stages", "run"]
 __all__ += ["marked_planes", "of_polygon", "plane_of", "relief", "specks"]
 
-#: What is measured, in the order of a call: key, heading.
+#: Stages in the order of a call: key, heading.
 STAGES = {
-    "sure": "sure matches",
+    "sure": "confident matches",
     "matches": "all matches",
     "loop": "after the loop",
-    "fit": "after the last fit",
+    "fit": "after the final fit",
     "result": "result",
 }
-#: Confidence from which on a match is sure.
+#: Minimum confidence of a confident match.
 SURE = 0.5
-#: Functions of ``result.finish`` that ``--without`` leaves out, by the word that it takes.
-PARTS = {"votes": "vote_depth", "flattening": "flatten"}
-#: Fewer pixels make no plane.
-FEWEST_PIXELS = 50
-#: Name of the file with hand-marked planes, beside the calibration of its pairs.
+#: Functions of ``result.finish`` that ``--without`` disables.
+PARTS = {"median": "filter_depth", "planar": "flatten"}
+#: Minimum number of pixels of a plane.
+MIN_PIXELS = 50
+#: File with hand-marked planes, and calibration of its pairs in the same folder.
 PLANES, CALIBRATION = "planes.json", "stereodemo_calibration.json"
 
 
 @dataclass
 class Stages:
-    """The maps ``(H, W)``, metres, that a guided call passes through, at the image's size.
+    """The maps ``(H, W)``, metres, after the stages of a guided call, at the image's size.
 
-    ``matches`` are the winners of all pixels, also of those that the views do not agree on; ``sure`` is NaN
-    where no match is sure.
+    ``matches`` has the best match of every pixel, including inconsistent ones; ``sure`` is NaN where no match
+    is confident.
     """
 
     sure: np.ndarray | None = None
@@ -70,12 +70,13 @@ class Stages:
     fit: np.ndarray | None = None
     result: np.ndarray | None = None
     confidence: np.ndarray | None = None
+    sigma: np.ndarray | None = None
     verdict: str = ""
     trusted: bool = False
     pose: str = ""
 
     def of(self, stage: str) -> np.ndarray:
-        """The map of a key of ``STAGES``; all NaN where the call had no such stage."""
+        """Return the map of a key of ``STAGES``; all NaN if the call had no such stage."""
         found = getattr(self, stage)
         assert self.result is not None  # the call has ended
         return np.full_like(self.result, np.nan) if found is None else found
@@ -94,7 +95,7 @@ class Stages:
 
 @contextmanager
 def _observed() -> Iterator[Stages]:
-    """Record the stages of the guided call, of one image and one member, that is made within."""
+    """Record the stages of a guided call with one image and one member."""
     stages, refine, fit = Stages(), finish.refine, finish.fit_depth
 
     def refining(evidence: Evidence, members: Sequence[Member], depth_m: Tensor, *more: Any) -> Any:
@@ -115,7 +116,7 @@ def _observed() -> Iterator[Stages]:
 
 @dataclass(frozen=True)
 class Flatness:
-    """How far a map is from a plane, % of the plane's mean inverse depth: root mean square, and MAD.
+    """Deviation of a map from a plane, % of the plane's mean inverse depth: root mean square, and MAD.
 
     The MAD is the median absolute deviation times 1.4826, the standard deviation of a normal distribution.
     """
@@ -125,12 +126,12 @@ class Flatness:
 
 
 def flatness(depth_m: np.ndarray, inside: np.ndarray) -> Flatness:
-    """Residual of the inverse depth of ``depth_m (H, W)`` from its best plane ``inside (H, W)`` bool.
+    """Compute the residual of the inverse depth of ``depth_m (H, W)`` from its best plane ``inside (H, W)``.
 
-    A plane in space is a plane in inverse depth over the pixels. Pixels without a depth do not count.
+    A plane in space is a plane in inverse depth over the pixels. Pixels without depth are ignored.
     """
     known = inside & np.isfinite(depth_m)
-    if known.sum() < FEWEST_PIXELS:
+    if known.sum() < MIN_PIXELS:
         return Flatness(np.nan, np.nan)
     inverse = 1.0 / depth_m[known].astype(np.float64)
     residual = inverse - plane_of(depth_m, known)
@@ -140,9 +141,9 @@ def flatness(depth_m: np.ndarray, inside: np.ndarray) -> Flatness:
 
 
 def specks(depth_m: np.ndarray, inside: np.ndarray) -> float:
-    """Detail of a pixel or a few, per mille of the inverse depth ``inside (H, W)`` bool of a map ``(H, W)``.
+    """Compute the amplitude of specks, per mille of the inverse depth, at the pixels ``inside (H, W)`` bool.
 
-    The 99th percentile of the distance from the median of 5x5 pixels.
+    This is the 99th percentile of the distance from the median of 5x5 pixels.
     """
     inverse = (1.0 / depth_m).astype(np.float32)
     away = np.abs(inverse / cv2.medianBlur(inverse, 5) - 1.0)
@@ -150,7 +151,7 @@ def specks(depth_m: np.ndarray, inside: np.ndarray) -> float:
 
 
 def plane_of(depth_m: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """``(N,)`` 1/m, the best plane of the inverse depth of ``depth_m (H, W)`` at the pixels ``inside``."""
+    """Fit a plane ``(N,)`` 1/m to the inverse depth of ``depth_m (H, W)`` at the pixels ``inside``."""
     row, column = np.nonzero(inside)
     terms = np.stack([np.ones(len(row)), row - row.mean(), column - column.mean()], 1)
     inverse = 1.0 / depth_m[inside].astype(np.float64)
@@ -158,34 +159,36 @@ def plane_of(depth_m: np.ndarray, inside: np.ndarray) -> np.ndarray:
 
 
 def of_polygon(polygon: Sequence[Sequence[float]], size: tuple[int, int]) -> np.ndarray:
-    """``(H, W)`` bool of a polygon of (x, y)."""
+    """Rasterize a polygon of (x, y) as ``(H, W)`` bool."""
     image = Image.new("1", size[::-1])
     ImageDraw.Draw(image).polygon([tuple(corner) for corner in polygon], fill=1)
     return np.array(image)
 
 
 def guided_stages(pipe: Any, images: tuple[np.ndarray, np.ndarray], rig: Rig, seed: int = 0) -> Stages:
-    """The stages of a guided call on a left and a right image ``(H, W, 3)`` uint8."""
+    """Record the stages of a guided call on a left and a right image ``(H, W, 3)`` uint8."""
     left, right = images
     guidance = GeometryGuidance(right, (rig.K_left, rig.K_right), rig.E)
     with _observed() as stages:
         out = pipe(Image.fromarray(left), guidance=guidance, generator=torch.Generator().manual_seed(seed))
-    stages.result, stages.confidence = out.prediction[0, ..., 0], out.confidence[0, ..., 0]
-    stages.verdict, stages.trusted = out.verdicts[0].sentence, out.verdicts[0].trusted
+    stages.result, stages.confidence, stages.sigma = (
+        values[0, ..., 0] for values in (out.prediction, out.confidence, out.sigma)
+    )
+    stages.verdict, stages.trusted = str(out.verdicts[0].summary or ""), out.verdicts[0].trusted
     stages.pose = out.poses[0].status if out.poses else ""
     return stages
 
 
 def _planes_table(rows: Mapping[str, tuple[Stages, np.ndarray]]) -> Table:
-    """A row for each plane: RMS / MAD by stage; of the result specks, sure matches and stated confidence."""
-    heads = (*STAGES.values(), "specks", "sure", "confidence")
+    """Make a row per plane: RMS / MAD by stage; specks, confident matches and confidence of the result."""
+    heads = (*STAGES.values(), "specks", "confident", "confidence")
     table = Table("plane", *heads, title="RMS / MAD from the best plane, %; specks, per mille")
     values, of_result = [], []
     for name, (stages, inside) in rows.items():
         flat = [flatness(stages.of(stage), inside) for stage in STAGES]
-        share = np.isfinite(stages.of("sure"))[inside].mean()
+        fraction = np.isfinite(stages.of("sure"))[inside].mean()
         stated = float(stages.of("confidence")[inside].mean())
-        of_result.append((specks(stages.of("result"), inside), share, stated))
+        of_result.append((specks(stages.of("result"), inside), fraction, stated))
         table.add_row(
             name, *(f"{f.rms:.1f} / {f.mad:.1f}" for f in flat), *(f"{v:.2f}" for v in of_result[-1])
         )
@@ -194,24 +197,24 @@ def _planes_table(rows: Mapping[str, tuple[Stages, np.ndarray]]) -> Table:
     table.add_row(
         "mean", *(f"{a:.2f} / {b:.2f}" for a, b in mean), *(f"{v:.2f}" for v in np.mean(of_result, 0))
     )
-    table.add_row("most", *(f"{a:.1f} / {b:.1f}" for a, b in most), f"{max(of_result)[0]:.2f}", "", "")
+    table.add_row("maximum", *(f"{a:.1f} / {b:.1f}" for a, b in most), f"{max(of_result)[0]:.2f}", "", "")
     return table
 
 
 def _surfaces_table(rows: Mapping[str, tuple[Stages, Any]]) -> Table:
-    """A row for each pair with truth: surface error by stage, AbsRel of the result, what it is said to be."""
+    """Make a row per pair with ground truth: surface error by stage; AbsRel and confidence of the result."""
     shown = ("loop", "fit", "result")
     heads = (*(STAGES[stage] for stage in shown), "AbsRel", "within 10 %", "confidence")
-    table = Table("pair", *heads, title="error of the slope of log depth, per mille a pixel")
+    table = Table("pair", *heads, title="error of the slope of log depth, per mille per pixel")
     values = []
     for name, (stages, sample) in rows.items():
-        truth = sample.depth_m, sample.valid
+        ground_truth = sample.depth_m, sample.valid
         result = stages.of("result")
-        errors = [surface_error(stages.of(stage), *truth) for stage in shown]
+        errors = [surface_error(stages.of(stage), *ground_truth) for stage in shown]
         right = np.abs(result / np.where(sample.valid, sample.depth_m, 1.0) - 1.0) < 0.1
         stated = stages.of("confidence")[sample.valid].mean()
         values.append(
-            [*errors, evaluate_depth(result, *truth)["abs_rel"], right[sample.valid].mean(), stated]
+            [*errors, evaluate_depth(result, *ground_truth)["abs_rel"], right[sample.valid].mean(), stated]
         )
         table.add_row(name, *(f"{v:.2f}" for v in values[-1][:3]), *(f"{v:.3f}" for v in values[-1][3:]))
     mean = np.mean(values, axis=0)
@@ -220,7 +223,7 @@ def _surfaces_table(rows: Mapping[str, tuple[Stages, Any]]) -> Table:
 
 
 def draw_stages(left: np.ndarray, stages: Stages, path: Path) -> None:
-    """The left image and the inverse depth of every stage side by side, on one scale of colours."""
+    """Draw the left image and the inverse depth of every stage side by side, on one colour scale."""
     figure, axes = plt.subplots(2, 4, figsize=(20, 8.5), layout="constrained")
     inverse = {stage: 1.0 / stages.of(stage) for stage in STAGES}
     low, high = np.quantile(inverse["result"], (0.01, 0.99))
@@ -239,18 +242,18 @@ def draw_stages(left: np.ndarray, stages: Stages, path: Path) -> None:
     plt.close(figure)
 
 
-#: Relative change of inverse depth over a pixel that the relief shows black or white.
+#: Relative change of inverse depth per pixel that the relief shows as black or white.
 RELIEF = 0.02
 
 
 def relief(depth_m: np.ndarray) -> np.ndarray:
-    """``(H, W)`` in [0, 1]: the slope of log depth towards the lower right; a plane has an even grey."""
+    """Shade the slope of log depth towards the lower right, ``(H, W)`` in [0, 1]; planes are grey."""
     down, across = np.gradient(np.log(depth_m))
     return np.clip(0.5 + (down + across) / (2.0 * RELIEF), 0.0, 1.0)
 
 
 def marked_planes(root: Path) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray], Rig, dict[str, Any]]]:
-    """Name, images, cameras and planes of every pair of a folder with ``PLANES``."""
+    """Yield name, images, cameras and planes of every pair in a folder with ``PLANES``."""
     rig = read_calibration(root / CALIBRATION)
     for name, planes in json.loads((root / PLANES).read_text()).items():
         if isinstance(planes, dict):
@@ -259,22 +262,15 @@ def marked_planes(root: Path) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarra
 
 
 def _unchanged(depth_m: Tensor, *_: Any) -> Tensor:
-    """In place of a part that is left out."""
+    """Replace a disabled stage."""
     return depth_m
 
 
-def main(
-    data: Annotated[list[str], typer.Option(help="Folder with planes.json, data sets or synthetic-plain:N.")],
-    prior: Annotated[str, typer.Option(help="The prior that is guided.")] = "bundled",
-    seed: Annotated[int, typer.Option(help="Of the call.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="Folder for a figure of each pair.")] = None,
-    without: Annotated[str, typer.Option(help="A part to leave out: votes or flattening.")] = "",
-) -> None:
-    """Print how flat planes and how smooth rendered surfaces are by stage, and draw the stages."""
-    if without:
-        check_choice(without, "without", PARTS)
+def run(_: str, options: SurfacesOptions) -> None:
+    """Print planarity and surface errors by stage, and draw the stages."""
+    without = options.without
     with patch.object(finish, PARTS[without], _unchanged) if without else nullcontext():
-        _run(data, prior, seed, out)
+        _run(options.data, options.prior, options.seed, options.out)
 
 
 def _run(data: Sequence[str], prior: str, seed: int, out: Path | None) -> None:
@@ -291,7 +287,7 @@ def _run(data: Sequence[str], prior: str, seed: int, out: Path | None) -> None:
             continue
         for ref in find_pairs(root):
             sample = load(ref)
-            rig = Rig(sample.K_left, sample.K_right, sample.E)
+            rig = made_rig(sample.K_left, sample.K_right, sample.E)
             stages = guided_stages(pipe, (sample.left, sample.right), rig, seed)
             _describe(console, ref.name, sample.left, stages, out)
             surfaces[ref.label] = stages, sample
@@ -301,7 +297,7 @@ def _run(data: Sequence[str], prior: str, seed: int, out: Path | None) -> None:
 
 
 def _describe(console: Console, name: str, left: np.ndarray, stages: Stages, out: Path | None) -> None:
-    said = "trusted" if stages.trusted else stages.verdict
-    console.print(f"{name}: {said}; pose {stages.pose}", highlight=False, soft_wrap=True)
+    verdict = "trusted" if stages.trusted else stages.verdict
+    console.print(f"{name}: {verdict}; pose {stages.pose}", highlight=False, soft_wrap=True)
     if out is not None:
         draw_stages(left, stages, out / f"{name}.png")

@@ -5,12 +5,14 @@ import os
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.pairs import fresh_process
-from tests.lab.__main__ import LABORATORIES, PROGRAM, lab_app
+from tests.lab.__main__ import EXPERIMENTS, PROGRAM, lab_app
+
+pytestmark = pytest.mark.end_to_end
 
 
 def typed(*words):
@@ -33,8 +35,8 @@ def test_a_process_of_its_own_knows_the_rendered_pairs():
     assert np.array_equal(sample.left, load(ref).left)
 
 
-@pytest.mark.parametrize("name", LABORATORIES)
-def test_every_laboratory_says_what_it_takes_and_is_not_in_the_wheel(name):
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_has_help_and_is_not_in_the_wheel(name):
     helped = typed(name, "--help")
     assert helped.exit_code == 0 and f"{name} [OPTIONS]" in helped.stdout
     assert CliRunner().invoke(eval_app, [name, "--help"]).exit_code == 2
@@ -46,7 +48,7 @@ def test_every_laboratory_says_what_it_takes_and_is_not_in_the_wheel(name):
         ("trust", "--data must be given, or --rendered above 0"),
         ("trust --rendered 1 --width 16", "--width must be between 64"),
         ("trust --rendered 1 --kinds bent", "--kinds must be one of K-0.67"),
-        ("trust --rendered 1 --kinds unrelated", "without 'unrelated' where a pair is alone"),
+        ("trust --rendered 1 --kinds unrelated", "without 'unrelated' if there is only one pair"),
         ("strength --methods prior-fit@other", "--methods must be methods that use a prior"),
         ("strength --methods sgbm", "--methods must be methods that use a prior"),
         ("strength --strengths 7%", "--strengths"),

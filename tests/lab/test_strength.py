@@ -10,6 +10,8 @@ from tests.lab.edges import edge_error, surface_error
 from tests.lab.options import STRENGTHS, StrengthOptions
 from tests.lab.strength import against_table, relative_map
 
+pytestmark = pytest.mark.end_to_end
+
 SMALL = "synthetic:1+4@128x96"
 
 
@@ -19,7 +21,7 @@ def sample():
 
 
 @pytest.mark.parametrize("space", ["disparity", "depth", "log"])
-def test_a_prior_errs_as_much_as_it_says(sample, space):
+def test_an_emulated_prior_has_the_stated_error(sample, space):
     exact = relative_map(sample, STRENGTHS["exact"], space)
     assert exact.min() == 0.0 and exact.max() == 1.0
     off = [np.abs(relative_map(sample, STRENGTHS[s], space) - exact).mean() for s in ("2%", "5%", "20%")]
@@ -43,21 +45,25 @@ def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkey
 
 
 def test_errors_at_edges_and_of_surfaces():
-    truth, shifted = (np.where(np.arange(60)[None] < c, 2.0, 4.0).repeat(40, 0) for c in (30, 32))
-    valid = np.ones(truth.shape, bool)
-    assert edge_error(truth, truth, valid) == surface_error(truth, truth, valid) == 0.0
-    assert edge_error(shifted, truth, valid) > 0.1
-    assert surface_error(shifted, truth, valid) == 0.0
-    rough = truth * np.exp(0.01 * np.random.default_rng(0).normal(size=truth.shape))
-    assert surface_error(rough, truth, valid) > 5.0
-    assert np.isnan(edge_error(truth, np.full(truth.shape, 2.0), valid))
+    ground_truth, shifted = (np.where(np.arange(60)[None] < c, 2.0, 4.0).repeat(40, 0) for c in (30, 32))
+    valid = np.ones(ground_truth.shape, bool)
+    assert (
+        edge_error(ground_truth, ground_truth, valid)
+        == surface_error(ground_truth, ground_truth, valid)
+        == 0.0
+    )
+    assert edge_error(shifted, ground_truth, valid) > 0.1
+    assert surface_error(shifted, ground_truth, valid) == 0.0
+    rough = ground_truth * np.exp(0.01 * np.random.default_rng(0).normal(size=ground_truth.shape))
+    assert surface_error(rough, ground_truth, valid) > 5.0
+    assert np.isnan(edge_error(ground_truth, np.full(ground_truth.shape, 2.0), valid))
 
 
 def test_the_default_is_compared_with_others_pair_by_pair():
     errors = {"guided": (0.1, 0.2, 0.3, 0.4, 0.5), "prior-fit": (0.2, 0.3, 0.4, 0.5, 0.4)}
     records = [{"strength": "5%", "method": m, "abs_rel": e} for m, all_ in errors.items() for e in all_]
     table = against_table("All pairs", records)
-    ((strength_of, against, pairs, difference, share, won),) = table.rows
+    ((strength_of, against, pairs, difference, fraction, won),) = table.rows
     assert (strength_of, against, pairs, won) == ("5%", "prior fit", "5", "4 of 5")
-    assert difference.startswith("-0.0600 [-0.1000, ") and share == "-16.7"  # -0.06 of 0.36
+    assert difference.startswith("-0.0600 [-0.1000, ") and fraction == "-16.7"  # -0.06 of 0.36
     assert against_table("All pairs", records[5:]).rows == ()

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior
-from geodiff_plugin._checks import InputError
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from tests.lab.surfaces import STAGES, draw_stages, flatness, guided_stages, main, specks
+from geodiff_plugin.settings import settings_of
+from tests.lab.options import SurfacesOptions
+from tests.lab.surfaces import PARTS, STAGES, draw_stages, flatness, guided_stages, run, specks
+from tests.views import made_rig
+
+pytestmark = pytest.mark.end_to_end
 
 SMALL = "synthetic-plain:1@160x120"
 
@@ -54,7 +58,7 @@ def test_specks_are_detail_of_few_pixels_and_no_slope_or_wide_wave():
 def test_a_call_that_is_observed_gives_the_same_result_and_all_stages(tmp_path):
     sample = load(find_pairs(Path(SMALL))[0])
     pipe = enable_geometry_guidance(load_prior("bundled"))
-    rig = Rig(sample.K_left, sample.K_right, sample.E)
+    rig = made_rig(sample.K_left, sample.K_right, sample.E)
     stages = guided_stages(pipe, (sample.left, sample.right), rig)
     guidance = GeometryGuidance(sample.right, (sample.K_left, sample.K_right), sample.E)
     plain = pipe(sample.left, guidance=guidance, generator=torch.Generator().manual_seed(0))
@@ -67,19 +71,18 @@ def test_a_call_that_is_observed_gives_the_same_result_and_all_stages(tmp_path):
     assert (tmp_path / "figure.png").stat().st_size > 0
 
 
-def test_the_table_names_every_pair_with_truth(capsys):
-    main(data=[SMALL], out=None)
+def test_the_table_lists_every_pair_with_ground_truth(capsys):
+    run("surfaces", SurfacesOptions(data=(SMALL,)))
     shown = capsys.readouterr().out
     assert "plain0000" in shown
     assert "mean" in shown
 
 
 @pytest.mark.slow
-def test_a_part_that_is_left_out_changes_the_table_and_others_are_refused(capsys):
+def test_every_part_that_can_be_left_out_changes_the_table(capsys):
     shown = []
-    for without in ("", "votes", "flattening"):
-        main(data=[SMALL], without=without)
+    for without in (None, *PARTS):
+        run("surfaces", SurfacesOptions(data=(SMALL,), without=without))
         shown.append(capsys.readouterr().out)
     assert len(set(shown)) == 3
-    with pytest.raises(InputError, match="without"):
-        main(data=[SMALL], without="walls")
+    assert settings_of(SurfacesOptions)["without"].choices == tuple(PARTS)

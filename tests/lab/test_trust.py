@@ -11,6 +11,8 @@ from tests.lab import trust
 from tests.lab.options import TrustOptions
 from tests.lab.trust import KINDS, POINTS, RIGHT, WRONG
 
+pytestmark = pytest.mark.end_to_end
+
 SMALL = "synthetic:1+4@128x96"
 
 
@@ -19,14 +21,14 @@ def sample():
     return load(find_pairs(SMALL)[0])
 
 
-def test_every_kind_of_wrong_calibration_changes_what_it_says(sample):
+def test_every_kind_of_wrong_calibration_changes_what_its_title_states(sample):
     other = replace(sample, right=sample.right[::-1], K_right=2 * sample.K_right)
     cases = {kind: made.change(sample, other) for kind, made in KINDS.items()}
     expected = {"swapped": {"left", "right"}, "unrelated": {"right", "K_right"}}
-    expected |= dict.fromkeys(("mirrored", "one-picture", "shifted"), {"right"})
+    expected |= dict.fromkeys(("mirrored", "one-image", "shifted"), {"right"})
     expected |= dict.fromkeys(("moved-part", "rolling", "stretched"), {"right"})
     expected |= dict.fromkeys(("moved-across", "saved-twice"), {"right"})
-    expected |= dict.fromkeys(("bars", "upside-down"), {"left", "right"})
+    expected |= dict.fromkeys(("letterbox", "upside-down"), {"left", "right"})
     expected |= {"distorted": {"left", "right"}, "centre": {"K_right"}, "yaw": {"E"}}
     expected |= {kind: set() for kind, made in KINDS.items() if made.points or kind in RIGHT}
     names = ("left", "right", "K_left", "K_right", "E")

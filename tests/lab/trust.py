@@ -1,13 +1,13 @@
 """Wrong calibrations made on purpose: whether a run detects them, and whether it trusts correct ones.
 
-The page is docs/reference/results-trust.md.
+The page is docs/appendix/results-trust.md.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -16,7 +16,8 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError, bad_value, check_choice
+from geodiff_plugin._internal.checks import InputError, bad_value, check_choice
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
@@ -24,24 +25,25 @@ from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pai
 from geodiff_plugin.evaluation.experiment import Experiment, Page, run_experiment
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.findings import ASSUMPTION
 from geodiff_plugin.jobs.journal import Item, Record
 from geodiff_plugin.jobs.report import used_poses
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
-from geodiff_plugin.result.misfit import expected_error, misfit_of
+from geodiff_plugin.result.expected_error import expected_error
 from geodiff_plugin.result.output import MetricDepthOutput
-from geodiff_plugin.types import DepthFrame
+from geodiff_plugin.trust import PoseUncertainty, match_error
 from tests.lab.options import TrustOptions
 
-#: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
+#: Median relative error above which a run must report a problem.
 OFF = 0.2
 TRUST_NOTE = (
-    "Errors of the depth as shares of the truth; left and right exchanged, there is no truth. A wrong focal "
-    "length of a rectified pair scales the depth and changes nothing else: two views cannot show it. "
-    "Confidence and expected error, as a share of the depth and its median, are those of pixels with truth."
+    "Errors are relative to ground truth, which swapped images do not have. A wrong focal length "
+    "of a rectified pair only scales the depth, which two views cannot reveal. Confidence and expected error "
+    "(its median, relative to the depth) are over the pixels with ground truth."
 )
 #: Coefficient k1 of the distortion that is not removed.
 BARREL = -0.25
-#: Known points of the kinds about points: so many of the truth.
+#: Known points of the kinds about points: so many of ground truth.
 POINTS = 200
 Change = Callable[[StereoSample, StereoSample], StereoSample]
 
@@ -54,7 +56,7 @@ def moved(sample: StereoSample, centre: np.ndarray) -> StereoSample:
 
 
 def _scaled(sample: StereoSample, factor: float) -> StereoSample:
-    """Focal lengths of another size; the principal point stays in the middle, where it says nothing."""
+    """Scale the focal lengths; the principal point stays in the centre, where it reveals nothing."""
     scale = np.diag((factor, factor, 1.0))
     return replace(sample, K_left=sample.K_left @ scale, K_right=sample.K_right @ scale)
 
@@ -67,13 +69,13 @@ def _tilted(sample: StereoSample, _: StereoSample) -> StereoSample:
 
 
 def _shifted(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """The right picture is the left one, moved: every disparity is the same."""
+    """The right image is the left one, moved: every disparity is the same."""
     shift = max(2, sample.left.shape[1] // 20)
     return replace(sample, right=np.roll(sample.left, -shift, axis=1), K_right=sample.K_left)
 
 
 def _px(sample: StereoSample, px: float) -> float:
-    """Pixels of a picture 640 wide, in those of the sample."""
+    """Convert pixels of an image 640 wide to pixels of the sample."""
     return px * sample.left.shape[1] / 640
 
 
@@ -87,7 +89,7 @@ def _barrel(image: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def _distorted(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """Distortion that was not removed, in both views; the truth is bent as the left one."""
+    """Distortion that was not removed, in both views; ground truth is bent as the left one."""
     depth_m = _barrel(np.where(sample.valid, sample.depth_m, 0), sample.K_left)
     return replace(
         sample,
@@ -99,28 +101,28 @@ def _distorted(sample: StereoSample, _: StereoSample) -> StereoSample:
 
 
 def _moved_part(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """The middle third of the rows of the right picture has moved along them."""
+    """The middle third of the rows of the right image has moved along them."""
     right, third = sample.right.copy(), len(sample.right) // 3
     right[third : 2 * third] = np.roll(right[third : 2 * third], round(_px(sample, 30)), axis=1)
     return replace(sample, right=right)
 
 
 def _rolled(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """A rolling shutter: rows of the right picture shift the more the lower they lie."""
+    """A rolling shutter: rows of the right image shift the more the lower they lie."""
     v, u = np.indices(sample.right.shape[:2], dtype=np.float32)
     shift = np.float32(_px(sample, 15)) * v / len(v)
     return replace(sample, right=cv2.remap(sample.right, u + shift, v, cv2.INTER_LINEAR))
 
 
 def _off_centre(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """The right principal point is off, so that what is far lies behind infinity."""
+    """The right principal point is off, so that what is far lies at negative disparity."""
     K_right = sample.K_right.copy()
     K_right[0, 2] -= _px(sample, 10)
     return replace(sample, K_right=K_right)
 
 
 def _stretched(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """The right picture without a tenth of its columns, stretched to its size."""
+    """The right image without a tenth of its columns, stretched to its size."""
     height, width = sample.right.shape[:2]
     part = sample.right[:, : width - width // 10]
     return replace(sample, right=cv2.resize(part, (width, height)))
@@ -138,7 +140,7 @@ def _off_pose(
 ) -> StereoSample:
     """``E`` turned about, and moved along, axes that chance takes: all errors are independent of each other.
 
-    ``shift`` is in baselines. The baseline then has its own length again, but for the share ``length``.
+    ``shift`` is in baselines. The baseline then gets its own length again, plus the fraction ``length``.
     """
     rng = np.random.default_rng(list(sample.E.tobytes()))
     axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
@@ -150,17 +152,17 @@ def _off_pose(
 
 
 def _moved_across(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """The middle of the right picture, an ellipse of two fifths of it, has moved across the rows as well."""
+    """The middle of the right image, an ellipse of two fifths of it, has moved across the rows as well."""
     height, width = sample.right.shape[:2]
     v, u = np.indices((height, width))
     inside = ((u - width / 2) / (0.36 * width)) ** 2 + ((v - height / 2) / (0.44 * height)) ** 2 < 1
     shift = np.array([[1, 0, _px(sample, 5)], [0, 1, _px(sample, 6)]], np.float32)
-    moved_picture = cv2.warpAffine(sample.right, shift, (width, height), borderMode=cv2.BORDER_REFLECT)
-    return replace(sample, right=np.where(inside[..., None], moved_picture, sample.right))
+    warped = cv2.warpAffine(sample.right, shift, (width, height), borderMode=cv2.BORDER_REFLECT)
+    return replace(sample, right=np.where(inside[..., None], warped, sample.right))
 
 
 def _between_bars(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """Both pictures are squeezed to three quarters of their width, between black bars; K is not."""
+    """Both images are squeezed to three quarters of their width, between black bars; K is not."""
 
     def squeezed(image: np.ndarray, way: int = cv2.INTER_AREA) -> np.ndarray:
         height, width = image.shape[:2]
@@ -171,18 +173,18 @@ def _between_bars(sample: StereoSample, _: StereoSample) -> StereoSample:
         return made
 
     depth_m = squeezed(np.where(sample.valid, sample.depth_m, 0), cv2.INTER_NEAREST)
-    pictures = {"left": squeezed(sample.left), "right": squeezed(sample.right)}
-    return replace(sample, **pictures, depth_m=depth_m, valid=depth_m > 0)
+    images = {"left": squeezed(sample.left), "right": squeezed(sample.right)}
+    return replace(sample, **images, depth_m=depth_m, valid=depth_m > 0)
 
 
 def _upside_down(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """Both pictures are turned by 180 degrees, and the truth with the left one."""
+    """Both images are turned by 180 degrees, and ground truth with the left one."""
     names = ("left", "right", "depth_m", "valid")
     return replace(sample, **{name: getattr(sample, name)[::-1, ::-1].copy() for name in names})
 
 
 def _saved_twice(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """The left picture as it is, and as a JPEG."""
+    """The left image as it is, and as a JPEG."""
     again = cv2.imdecode(cv2.imencode(".jpg", sample.left, [cv2.IMWRITE_JPEG_QUALITY, 70])[1], 1)
     return replace(sample, right=again, K_right=sample.K_left)
 
@@ -193,7 +195,7 @@ def _as_it_is(sample: StereoSample, _: StereoSample) -> StereoSample:
 
 @dataclass(frozen=True)
 class Kind:
-    """A calibration: what it is, how a sample comes to have it beside another sample, given points' factor.
+    """A calibration: what it is, how a sample comes to have it next to another sample, given points' factor.
 
     ``points`` is what true points are multiplied by, ``None`` where no points are given.
     """
@@ -206,33 +208,33 @@ class Kind:
 KINDS: dict[str, Kind] = {
     "right": Kind("correct"),
     "right, points": Kind("correct, points", points=1.0),
-    "swapped": Kind("left and right images exchanged", lambda s, _: replace(s, left=s.right, right=s.left)),
+    "swapped": Kind("left and right images swapped", lambda s, _: replace(s, left=s.right, right=s.left)),
     "inverse": Kind("E is world-to-camera", lambda s, _: replace(s, E=np.linalg.inv(s.E))),
-    "axis": Kind("E along y where it is along x", lambda s, _: moved(s, s.E[[1, 0, 2], 3])),
-    "tilted": Kind("not rectified: 2 degrees of pitch", _tilted),
+    "axis": Kind("baseline along y instead of x", lambda s, _: moved(s, s.E[[1, 0, 2], 3])),
+    "tilted": Kind("right camera pitched by 2 degrees, not rectified", _tilted),
     "mirrored": Kind("right image mirrored", lambda s, _: replace(s, right=s.right[:, ::-1].copy())),
     "millimetres": Kind("baseline in millimetres", lambda s, _: moved(s, s.E[:3, 3] * 1000.0)),
-    "thousandth": Kind("baseline divided by 1000 once too often", lambda s, _: moved(s, s.E[:3, 3] * 0.001)),
-    "K-1.5": Kind("K of an image 1.5 times as large, centred", lambda s, _: _scaled(s, 1.5)),
-    "K-2": Kind("K of an image twice as large, centred", lambda s, _: _scaled(s, 2.0)),
-    "K-0.67": Kind("K of an image 0.67 times as large, centred", lambda s, _: _scaled(s, 0.67)),
+    "thousandth": Kind("baseline 1000 times too short", lambda s, _: moved(s, s.E[:3, 3] * 0.001)),
+    "K-1.5": Kind("focal lengths for an image 1.5x as large", lambda s, _: _scaled(s, 1.5)),
+    "K-2": Kind("focal lengths for an image 2x as large", lambda s, _: _scaled(s, 2.0)),
+    "K-0.67": Kind("focal lengths for an image 0.67x as large", lambda s, _: _scaled(s, 0.67)),
     "unrelated": Kind(
         "right image of another scene",
         lambda s, other: replace(s, right=other.right, K_right=other.K_right),
     ),
-    "one-picture": Kind("the left image twice", lambda s, _: replace(s, right=s.left, K_right=s.K_left)),
+    "one-image": Kind("the left image twice", lambda s, _: replace(s, right=s.left, K_right=s.K_left)),
     "shifted": Kind("right image a shifted copy of the left one", _shifted),
     "distorted": Kind("distortion of k1 = -0.25 in both views", _distorted),
-    "moved-part": Kind("a third of the right picture moved by 30 px", _moved_part),
+    "moved-part": Kind("a third of the right image's rows shifted by 30 px", _moved_part),
     "rolling": Kind("rolling shutter of 15 px", _rolled),
-    "centre": Kind("right cx off by 10 px, far things behind infinity", _off_centre),
-    "stretched": Kind("right picture cropped by a tenth and stretched", _stretched),
-    "moved-across": Kind("two fifths of the right picture moved by 5 and 6 px", _moved_across),
-    "bars": Kind("both pictures squeezed between bars", _between_bars),
-    "upside-down": Kind("both pictures upside down", _upside_down),
+    "centre": Kind("right cx off by 10 px, negative disparities far away", _off_centre),
+    "stretched": Kind("right image cropped by a tenth and stretched", _stretched),
+    "moved-across": Kind("two fifths of the right image shifted by (5, 6) px", _moved_across),
+    "letterbox": Kind("both images squeezed and letterboxed", _between_bars),
+    "upside-down": Kind("both images upside down", _upside_down),
     "saved-twice": Kind("the left image twice, once as a JPEG", _saved_twice),
     "feet": Kind("baseline in feet", lambda s, _: moved(s, s.E[:3, 3] / 0.3048)),
-    "yaw": Kind("E turned by 1 degree of yaw", _yawed),
+    "yaw": Kind("E rotated by 1 degree of yaw", _yawed),
     "pose-slight": Kind(
         "E off by 0.15 degrees and 3 % of the baseline", partial(_off_pose, turn_deg=0.15, shift=0.03)
     ),
@@ -243,7 +245,7 @@ KINDS: dict[str, Kind] = {
         "E off by 2 degrees and 20 % of the baseline", partial(_off_pose, turn_deg=2.0, shift=0.2)
     ),
     "pose-rough-long": Kind(
-        "E off by 0.6 degrees and 8 %, and 12 % too long",
+        "E off by 0.6 degrees and 8 %, baseline 12 % too long",
         partial(_off_pose, turn_deg=0.6, shift=0.08, length=0.12),
     ),
     "long": Kind("baseline 12 % too long", lambda s, _: moved(s, 1.12 * s.E[:3, 3])),
@@ -256,15 +258,14 @@ WRONG = [kind for kind in KINDS if kind not in RIGHT]
 
 
 def _points(sample: StereoSample) -> np.ndarray:
-    """``(POINTS, 3)`` of the truth, metres in the left camera's frame."""
-    frame = DepthFrame("left", sample.depth_m, sample.valid, sample.K_left, np.eye(4))
-    points = frame.world(sample.valid)
+    """``(POINTS, 3)`` of ground truth, metres in the left camera's frame."""
+    points = Camera(sample.K_left).unproject(sample.depth_m)[sample.valid]
     return points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
 
 
 def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, settings: Settings) -> Record:
-    """One guided call, what was said of it, and how far it is off."""
-    original = read(ref).check_truth()
+    """Make one guided call, and return its messages and its error."""
+    original = read(ref).check_ground_truth()
     made = KINDS[kind]
     sample = made.change(original, read(other))
     points = None if made.points is None else made.points * _points(original)
@@ -279,13 +280,12 @@ def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, 
             return head | {"status": "refused", "said": [str(error)], "off": None}
         said = [str(warning.message) for warning in caught if warning.category is UserWarning]
     verdict, depth_m = out.verdicts[0], out.prediction[0, ..., 0]
-    of_verdict = {message.code for message in (verdict.message, *verdict.remarks) if message is not None}
-    said += [message for message in out.warnings if message.code not in of_verdict]
+    said += [
+        str(each) for each in out.findings if each.severity is not ASSUMPTION and each != verdict.summary
+    ]
     errors = np.abs(depth_m[sample.valid] / sample.depth_m[sample.valid] - 1.0)
     off = None if kind == "swapped" else float(np.median(errors))  # the truth is the other image's there
-    signs = {name: None if value != value else value for name, value in asdict(verdict.indicators).items()}
-    said += [*verdict.reasons, *verdict.remarks]
-    head |= {"codes": [message.code for message in verdict.reasons], "signs": signs}
+    head |= {"codes": [reason.code for reason in verdict.reasons], "facts": verdict.facts.as_record()}
     head |= {"status": verdict.status, "said": said, "off": off}
     return head if off is None else head | _promise(sample, out, guidance, errors)
 
@@ -293,10 +293,10 @@ def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, 
 def _promise(
     sample: StereoSample, out: MetricDepthOutput, guidance: GeometryGuidance, errors: np.ndarray
 ) -> Record:
-    """What a result promises where there is truth, and what it keeps; ``errors`` are shares of the truth."""
+    """Compare predicted and observed accuracy; ``errors`` are relative to ground truth."""
     depth_m, confidence = out.prediction[0, ..., 0], out.confidence
-    found = out.verdict.indicators
-    errors_of = np.nan_to_num(found.scale_spread), misfit_of(found, depth_m.shape)
+    facts = out.verdict.facts
+    errors_of = PoseUncertainty.scale_rel_std(facts), match_error(facts)
     expected_m = expected_error(depth_m, sample.K_left, used_poses(out, guidance), *errors_of)
     return {
         "abs_rel": float(errors.mean()),
@@ -306,10 +306,10 @@ def _promise(
     }
 
 
-def _share(group: Sequence[Record], *, told: bool = True, off: bool = False) -> str:
-    """Of records, or of those whose depth is off, how many were told, or else not trusted."""
+def _share(group: Sequence[Record], *, reported: bool = True, off: bool = False) -> str:
+    """Count records, or those whose depth is off, that have a message or are not trusted."""
     counted = [record for record in group if not off or record["off"] is None or record["off"] > OFF]
-    part = sum(record["status"] != "trusted" or (told and bool(record["said"])) for record in counted)
+    part = sum(record["status"] != "trusted" or (reported and bool(record["said"])) for record in counted)
     return f"{part} of {len(counted)} ({100 * part // len(counted)} %)" if counted else "-"
 
 
@@ -319,39 +319,39 @@ def _median(group: Sequence[Record]) -> str:
 
 
 def _mean_of(name: str, group: Sequence[Record]) -> str:
-    """Mean of what was measured against the truth; an AbsRel above 10 counts as 10."""
+    """Mean of what was measured against ground truth; an AbsRel above 10 counts as 10."""
     return tables.mean_cell((None if (x := r.get(name)) is None else min(x, 10.0) for r in group), 2)
 
 
 _COLUMNS: dict[str, CellOf] = {
-    "given as": lambda group: KINDS[group[0]["kind"]].title,
+    "input": lambda group: KINDS[group[0]["kind"]].title,
     "median error": _median,
     "AbsRel": partial(_mean_of, "abs_rel"),
     "within 10 %": partial(_mean_of, "kept"),
     "confidence": partial(_mean_of, "promised"),
     "expected error": partial(_mean_of, "expected"),
-    "not trusted": partial(_share, told=False),
-    "anything said": _share,
-    f"said, of those > {OFF:.0%} off": partial(_share, off=True),
+    "not trusted": partial(_share, reported=False),
+    "any message": _share,
+    f"flagged, of errors > {OFF:.0%}": partial(_share, off=True),
 }
 
 
 def _table(source: str, records: Sequence[Record]) -> Table:
     """A row a kind, then all wrong ones, with and without those that two views cannot show."""
     pairs = count_of_pairs(len({record["sample"] for record in records}), f"{source} ")
-    title = f"Wrong calibrations detected, right ones not trusted: {pairs}"
+    title = f"Wrong calibrations detected, correct ones not trusted: {pairs}"
     table = tables.table_of_groups(title, records, ("kind",), _COLUMNS, TRUST_NOTE)
     wrong = [record for record in records if record["kind"] in WRONG]
     # Rectified rows stay rows under any focal length.
     seen = [record for record in wrong if not (record["rectified"] and record["kind"].startswith("K-"))]
-    sums = {"all wrong ones": wrong, "without focal lengths of rectified pairs": seen}
+    sums = {"all wrong inputs": wrong, "all but focal lengths of rectified pairs": seen}
     empty = [""] * (len(_COLUMNS) - 2)
     more = ((name, *empty, _share(group, off=True)) for name, group in sums.items())
     return replace(table, rows=(*table.rows, *more))
 
 
 def _real_and_rendered(options: TrustOptions) -> dict[str, list[SampleRef]]:
-    """The first pairs of ``--data``, and as many rendered ones as ``--rendered`` says."""
+    """Return the first pairs of ``--data``, and ``--rendered`` rendered ones."""
     if options.data is None and not options.rendered:
         bad_value("--data", "given, or --rendered above 0", "neither")
     real = [] if options.data is None else some_pairs(find_pairs(options.data), options.data)
@@ -389,7 +389,7 @@ def run(name: str, options: TrustOptions) -> Page | None:
     right = RIGHT if any(KINDS[kind].points for kind in asked) else RIGHT[:1]
     pairs = _real_and_rendered(options)
     if "unrelated" in options.kinds and any(len(refs) == 1 for refs in pairs.values()):
-        bad_value("--kinds", "without 'unrelated' where a pair is alone", "it", "Give two pairs or more.")
+        bad_value("--kinds", "without 'unrelated' if there is only one pair", "it", "Give two pairs or more.")
     cells = _cells(pairs, tuple(dict.fromkeys((*right, *asked))), options.settings, PriorCache())
 
     def page_tables(records: list[Record]) -> list[Table]:

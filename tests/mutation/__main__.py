@@ -14,7 +14,15 @@ from cosmic_ray.work_item import MutationSpec, TestOutcome, WorkerOutcome, WorkI
 
 from tests.mutation import __doc__ as DESCRIPTION
 from tests.mutation.coverage_map import ROOT, CoverageMap, LineIndex, RecordedTest
-from tests.mutation.sampling import EXCLUDED, Mutant, changed_lines, draw, equivalents, package_files
+from tests.mutation.sampling import (
+    EXCLUDED,
+    Mutant,
+    changed_lines,
+    draw,
+    equivalents,
+    every_line,
+    package_files,
+)
 from tests.mutation.worker import KILLED, SURVIVED, TIMED_OUT, Outcome, prepare, run_tests
 
 FOLDER = ROOT / ".mutation"
@@ -24,7 +32,7 @@ EQUIVALENT = "equivalent"
 def main(arguments: list[str]) -> int:
     """Draw, run and report; 1 if the rate is below ``--at-least``."""
     options = _parse(arguments)
-    keep = changed_lines(options.changed) if options.changed else lambda file, line: True
+    keep = changed_lines(options.changed) if options.changed else every_line
     mutants = draw(package_files(options.only), options.sample, options.seed, keep)
     FOLDER.mkdir(exist_ok=True)
     words = [word.rpartition("/")[2] for word in options.only]
@@ -49,7 +57,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         "--changed", nargs="?", const="main", metavar="COMMIT", help="Draw from lines changed since a commit."
     )
     add("--retry", action="store_true", help="Run the survivors again, for example after writing tests.")
-    add("--keep-records", action="store_true", help="Renew only the records of tests for --only.")
+    add("--keep-records", action="store_true", help="Record only tests for --only again; without it, none.")
     add("--test-seconds", type=float, default=30.0, help="Tests per mutant, in seconds (default: 30).")
     add(
         "--processes",
@@ -75,14 +83,16 @@ def _key(mutant: Mutant) -> str:
 def _to_run(database: WorkDB, mutants: list[Mutant], retry: bool) -> list[Mutant]:
     """The mutants without a result, and with ``retry`` the survivors; all become items of the database."""
     known = {item.job_id for item in database.work_items}
-    for mutant in mutants:
-        if _key(mutant) not in known:
-            place = (mutant.line, 0), (mutant.line, 1)
-            spec = MutationSpec(mutant.file, mutant.operator, mutant.occurrence, *place)
-            database.add_work_item(WorkItem.single(_key(mutant), spec))
+    new = {_key(mutant): mutant for mutant in mutants if _key(mutant) not in known}
+    database.add_work_items(WorkItem.single(key, _spec(mutant)) for key, mutant in new.items())
     status = {key: _status(result) for key, result in _results(database).items()}
     again = (None, SURVIVED) if retry else (None,)
     return [mutant for mutant in mutants if status.get(_key(mutant)) in again]
+
+
+def _spec(mutant: Mutant) -> MutationSpec:
+    place = (mutant.line, 0), (mutant.line, 1)
+    return MutationSpec(mutant.file, mutant.operator, mutant.occurrence, *place)
 
 
 def _run(database: WorkDB, todo: list[Mutant], tests: CoverageMap, options: argparse.Namespace) -> None:

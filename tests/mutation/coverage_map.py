@@ -16,16 +16,19 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import or_
 from pathlib import Path
 
 import coverage
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "geodiff_plugin"
+#: The tests that are run, as an expression of markers.
+TESTS = "not slow"
 #: Tests that drive other programs, or that check the repository and not the package.
 LEFT_OUT = tuple(
-    f"tests/{name}" for name in "browser kernels benchmarks mutation test_docs test_pack".split()
+    f"tests/{name}" for name in "browser kernels benchmarks mutation test_docs test_packaging".split()
 )
 
 Masks = dict[str, int]  # lines of each package file, as bits
@@ -101,8 +104,8 @@ class CoverageMap:
     def _record(self, files: list[Path], processes: int) -> None:
         with tempfile.TemporaryDirectory() as name:
             settings = os.environ | {"GEODIFF_MUTATION_RECORD": name, "PYTHONPATH": str(ROOT)}
-            command = [sys.executable, *"-m pytest -q -p tests.mutation.record -n".split(), str(processes)]
-            command += map(str, files)
+            command = [sys.executable, *"-m pytest -q -p tests.mutation.record -m".split(), TESTS]
+            command += ["-n", str(processes), *map(str, files)]
             with open(Path(name) / "log.txt", "w") as log:
                 subprocess.run(command, cwd=ROOT, env=settings, stdout=log, stderr=log, check=False)
             print(Path(name, "log.txt").read_text().strip().splitlines()[-1])
@@ -131,7 +134,10 @@ def _lines_by_test(recorded: Path) -> dict[str, Masks]:
     lines: dict[str, Masks] = defaultdict(lambda: defaultdict(int))
     for path in recorded.glob(".coverage*"):
         data = coverage.CoverageData(str(path))
-        data.read()
+        try:
+            data.read()
+        except coverage.exceptions.DataError:
+            continue  # left by a process that a test killed while it wrote
         for measured in data.measured_files():
             name = f"{PACKAGE}/{measured.rpartition(f'/{PACKAGE}/')[2]}"
             for line, contexts in data.contexts_by_lineno(measured).items():
@@ -173,24 +179,23 @@ class LineIndex:
         the body of its function. A constant or a field counts wherever a function uses its name.
         """
         tree = self.trees[file]
-        function = _innermost(tree, line, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
-        if function is not None and not isinstance(function, ast.Lambda):
+        around = [each for each in _functions(tree) if _first_line(each) <= line <= each.end_lineno]
+        if around:
+            function = max(around, key=_first_line)
             if line >= function.body[0].lineno:
                 return {file: _mask(*_statement(function, line))}
-            return {file: _mask(function.body[0].lineno, function.end_lineno)}
+            return {file: _body(function)}
         names = _defined_names(tree, line)
         uses = {name: mask for name, other in self.trees.items() if (mask := _uses(other, names))}
-        if file in uses or len(uses) > 0:
-            return uses
-        return {file: _function_lines(tree)}
+        return uses or {file: reduce(or_, map(_body, _functions(tree)), 0)}
 
 
-def _innermost(tree: ast.AST, line: int, kinds: tuple[type, ...]) -> ast.AST | None:
-    found = None
-    for node in ast.walk(tree):
-        if isinstance(node, kinds) and _first_line(node) <= line <= node.end_lineno:
-            found = node if found is None or _first_line(node) >= _first_line(found) else found
-    return found
+def _functions(tree: ast.AST) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
+    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def _body(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    return _mask(function.body[0].lineno, function.end_lineno)
 
 
 def _first_line(node: ast.AST) -> int:
@@ -199,20 +204,14 @@ def _first_line(node: ast.AST) -> int:
 
 def _statement(function: ast.AST, line: int) -> tuple[int, int]:
     """First and last line of the smallest statement around a line; of a compound one, its head."""
-    best = (line, line)
-    size = None
+    spans = [(line, line)]
     for node in ast.walk(function):
-        if (
-            not isinstance(node, ast.stmt)
-            or not _first_line(node) <= line <= node.end_lineno
-            or node is function
-        ):
-            continue
-        body = getattr(node, "body", None)
-        last = max(node.lineno, body[0].lineno - 1) if isinstance(body, list) else node.end_lineno
-        if line <= last and (size is None or last - node.lineno < size):
-            best, size = (node.lineno, last), last - node.lineno
-    return best
+        if isinstance(node, ast.stmt) and node is not function and _first_line(node) <= line:
+            body = getattr(node, "body", None)
+            last = max(node.lineno, body[0].lineno - 1) if isinstance(body, list) else node.end_lineno
+            if line <= last:
+                spans.append((node.lineno, last))
+    return min(spans[1:] or spans, key=lambda span: span[1] - span[0])
 
 
 def _defined_names(tree: ast.AST, line: int) -> set[str]:
@@ -228,22 +227,11 @@ def _defined_names(tree: ast.AST, line: int) -> set[str]:
 
 def _uses(tree: ast.AST, names: set[str]) -> int:
     mask = 0
-    for function in ast.walk(tree):
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
-            for node in ast.walk(function):
-                if isinstance(node, ast.Name | ast.Attribute) and names & {
-                    getattr(node, "id", None),
-                    getattr(node, "attr", None),
-                }:
-                    mask |= _mask(node.lineno, node.end_lineno)
-    return mask
-
-
-def _function_lines(tree: ast.AST) -> int:
-    mask = 0
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            mask |= _mask(node.body[0].lineno, node.end_lineno)
+    for function in _functions(tree):
+        for node in ast.walk(function):
+            # An ``ast.Name`` has an ``id``, an ``ast.Attribute`` an ``attr``.
+            if {getattr(node, "id", None), getattr(node, "attr", None)} & names:
+                mask |= _mask(node.lineno, node.end_lineno)
     return mask
 
 

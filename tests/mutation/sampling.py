@@ -18,13 +18,15 @@ from tests.mutation.operators import mutated, positions
 
 #: Files that are not mutated, each with the reason. Strings and log messages are not mutated in any file.
 EXCLUDED = {
-    r"kernels\.py$": "Triton kernels, which are compared with their references on their own",
-    r"/messages\.py$": "wording",
+    r"/kernels/": "Triton kernels, which are compared with their references on their own",
+    r"/findings\.py$": "wording",
     r"/cli/(terminal|info)\.py$": "wording and layout of the terminal",
     r"/__main__\.py$": "one call",
 }
-#: These end with ``kernels.py`` and are no Triton.
-INCLUDED = ("geodiff_plugin/_kernels.py", "geodiff_plugin/runtime/kernels.py")
+#: Of these one is, because tests run it with all others.
+INCLUDED = ("geodiff_plugin/runtime/kernels/group_norm.py",)
+#: Tokens that are no code.
+LAYOUT = {getattr(tokenize, name) for name in "COMMENT NL NEWLINE INDENT DEDENT ENDMARKER".split()}
 EQUIVALENT = Path(__file__).with_name("equivalent.toml")
 
 
@@ -66,7 +68,14 @@ def package_files(words: list[str]) -> list[str]:
     return [name for name in kept if not words or any(word in name for word in words)]
 
 
-def draw(files: list[str], sample: int, seed: int, keep: Callable[[str, int], bool]) -> list[Mutant]:
+def every_line(file: str, line: int) -> bool:
+    """Draw from all lines."""
+    return True
+
+
+def draw(
+    files: list[str], sample: int, seed: int, keep: Callable[[str, int], bool] = every_line
+) -> list[Mutant]:
     """A random sample: a line of code, one of the operators that fit it, one of its occurrences there."""
     rng = random.Random(seed)
     lines = [(file, line) for file in files for line in _code_lines(file) if keep(file, line)]
@@ -102,9 +111,7 @@ def changed_lines(reference: str) -> Callable[[str, int], bool]:
 
 def equivalents() -> dict[tuple[str, str, str], str]:
     """Reasons why a mutant changes nothing that matters, by file, line before and line after."""
-    if not EQUIVALENT.exists():
-        return {}
-    listed = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8")).get("mutant", [])
+    listed = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))["mutant"]
     return {(entry["file"], entry["before"], entry["after"]): entry["reason"] for entry in listed}
 
 
@@ -126,13 +133,5 @@ def _code_lines(file: str) -> Iterator[int]:
             and isinstance(node.value.value, str)
         ):
             documentation |= set(range(node.lineno, node.end_lineno + 1))
-    layout = {
-        tokenize.COMMENT,
-        tokenize.NL,
-        tokenize.NEWLINE,
-        tokenize.INDENT,
-        tokenize.DEDENT,
-        tokenize.ENDMARKER,
-    }
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
-    yield from sorted({t.start[0] for t in tokens if t.type not in layout} - documentation)
+    yield from sorted({token.start[0] for token in tokens if token.type not in LAYOUT} - documentation)

@@ -13,13 +13,16 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-from tests.mutation.coverage_map import PACKAGE, ROOT
+from tests.mutation.coverage_map import PACKAGE, ROOT, TESTS
 
 COPIED = (PACKAGE, *"tests examples docs pyproject.toml constraints.txt README.md mkdocs.yml".split())
 OPTIONS = "-x -q -n 0 -p no:cacheprovider -W ignore::pytest.PytestAssertRewriteWarning".split()
+OPTIONS += ["-m", TESTS]
 #: A mutant may take this many times the CPU time that its tests take without it, and this much more.
 SLOWER, MORE_S = 4.0, 30.0
 SURVIVED, KILLED, TIMED_OUT = "survived", "killed", "timed out"
+#: What pytest's exit status means: all passed, some failed, a file could not be imported.
+ENDED = {0: SURVIVED, 1: KILLED, 2: KILLED}
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,6 @@ class Checkout:
             if source.is_dir():
                 shutil.copytree(source, target)
             elif source.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(source, target)
         shared = ROOT.parent / "shared"
         if shared.exists():
@@ -135,9 +137,7 @@ def _wait(child: int, limit_s: float) -> str:
             code = os.waitstatus_to_exitcode(status)
             if code in (-signal.SIGXCPU, -signal.SIGKILL):
                 return TIMED_OUT
-            return {0: SURVIVED, 1: KILLED, 2: KILLED, 5: "no test"}.get(
-                code, KILLED if code < 0 else "error"
-            )
+            return KILLED if code < 0 else ENDED.get(code, "error")
         time.sleep(0.02)
     os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)

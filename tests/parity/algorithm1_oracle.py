@@ -1,7 +1,7 @@
 """Algorithm 1 of the paper, written once more from its equations, to hold the ``paper`` preset against.
 
 Nothing of ``geodiff_plugin`` is imported: warp, SSIM, noise arithmetic and autograd are torch's own. Choices
-that the paper leaves open are those of docs/reference/paper-map.md (E1 to E19), restated here.
+that the paper leaves open are those of docs/explanation/method.md (E1 to E19), restated here.
 """
 
 import torch

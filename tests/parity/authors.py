@@ -58,7 +58,7 @@ TEXT_1, TEXT = (
 
 
 def write_tokenizer(folder: Path | str, letters: str) -> tuple[str, str]:
-    """The files that ``CLIPTokenizer`` wants to be told, of some letters and no merges."""
+    """The files that ``CLIPTokenizer`` needs, with some letters and no merges."""
     vocabulary, merges = Path(folder) / "vocab.json", Path(folder) / "merges.txt"
     tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(letter + "</w>" for letter in letters)]
     vocabulary.write_text(json.dumps({token: i for i, token in enumerate(tokens)}))
@@ -66,7 +66,7 @@ def write_tokenizer(folder: Path | str, letters: str) -> tuple[str, str]:
     return str(vocabulary), str(merges)
 
 
-def picture(name: str, size: tuple[int, int], spread: float = 60.0) -> np.ndarray:
+def image(name: str, size: tuple[int, int], spread: float = 60.0) -> np.ndarray:
     """``(H, W, 3)`` uint8 of noise."""
     return np.clip(draw(name, (*size, 3)) * spread + 128, 0, 255).astype(np.uint8)
 

@@ -1,6 +1,6 @@
 """Run DepthFM's own code on tiny networks with named weights, and keep slices of what it computes.
 
-``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/appendix/parity.md`` describes the environment. Then, from the root of this repository::
 
     python -m tests.parity.depthfm_reference --authors depth-fm --out tests/parity/fixtures/depthfm.npz
 
@@ -39,7 +39,7 @@ SIZE, NOISING_STEP, STEPS = (64, 128), 400, 3
 
 def image_u8() -> np.ndarray:
     """``(H, W, 3)`` of noise."""
-    return authors.picture("image", SIZE, 50.0)
+    return authors.image("image", SIZE, 50.0)
 
 
 def prompt() -> np.ndarray:

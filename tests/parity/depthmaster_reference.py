@@ -1,6 +1,6 @@
 r"""Run DepthMaster's own code on tiny networks with named weights, and keep slices of what it computes.
 
-``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/appendix/parity.md`` describes the environment. Then, from the root of this repository::
 
     python -m tests.parity.depthmaster_reference --authors DepthMaster \
         --out tests/parity/fixtures/depthmaster.npz
@@ -26,7 +26,7 @@ SIZE = (48, 64)
 
 def image_u8() -> np.ndarray:
     """``(H, W, 3)`` of noise."""
-    return authors.picture("image", SIZE, 50.0)
+    return authors.image("image", SIZE, 50.0)
 
 
 def prompt() -> torch.Tensor:
@@ -41,7 +41,7 @@ def run_authors(folder: Path) -> dict[str, np.ndarray]:
     from depthmaster.modules import unet_2d_condition_s2 as theirs
     from diffusers import AutoencoderKL
 
-    # Their block has 1280 channels unless told otherwise, more than this U-Net's middle.
+    # Their block has 1280 channels by default, more than this U-Net's middle.
     theirs.BlockFE = functools.partial(theirs.BlockFE, dim=UNET["block_out_channels"][-1])
     unet = fill(theirs.UNet2DConditionModel(**UNET), "unet.").eval()
     pipe = DepthMasterPipeline(unet, fill(AutoencoderKL(**VAE), "vae.").eval(), None, None)

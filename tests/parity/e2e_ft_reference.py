@@ -1,6 +1,6 @@
 """Run the authors' own code of E2E-FT on tiny networks with named weights; keep slices of what it computes.
 
-``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/appendix/parity.md`` describes the environment. Then, from the root of this repository::
 
     python -m tests.parity.e2e_ft_reference --authors diffusion-e2e-ft/Marigold \
         --out tests/parity/fixtures/e2e_ft.npz
@@ -24,7 +24,7 @@ SIZE = (48, 64)
 
 def image_u8() -> np.ndarray:
     """``(H, W, 3)`` uint8."""
-    return authors.picture("e2e-ft/image", SIZE)
+    return authors.image("e2e-ft/image", SIZE)
 
 
 def run_authors(folder: Path) -> dict[str, np.ndarray]:

@@ -1,6 +1,6 @@
 """Run GeoWizard's own code on tiny networks with named weights, and keep slices of what it computes.
 
-``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/appendix/parity.md`` describes the environment. Then, from the root of this repository::
 
     python -m tests.parity.geowizard_reference --authors GeoWizard/geowizard \
         --out tests/parity/fixtures/geowizard.npz
@@ -29,7 +29,7 @@ CASES = {"v1_indoor": (10, "indoor"), "v1_object": (10, "object"), "v2_outdoor":
 
 def image_u8() -> np.ndarray:
     """``(H, W, 3)`` uint8."""
-    return authors.picture("geowizard/image", SIZE)
+    return authors.image("geowizard/image", SIZE)
 
 
 def noise() -> np.ndarray:
@@ -74,7 +74,7 @@ def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:
             files = authors.write_tokenizer(folder, string.ascii_lowercase)
             parts["tokenizer"] = CLIPTokenizer(*files)
         pipe = geowizard_v2_pipeline.DepthNormalEstimationPipeline(**parts)
-    if coupled:  # theirs refuses to without CUDA, and run_infer.py swallows that
+    if coupled:  # theirs fails without CUDA, and run_infer.py swallows that
         for module in pipe.unet.modules():
             if isinstance(module, CustomJointAttention):
                 module.set_use_memory_efficient_attention_xformers(True)

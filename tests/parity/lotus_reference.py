@@ -1,6 +1,6 @@
 """Run Lotus' own code on tiny networks with named weights, and keep slices of what it computes.
 
-``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/appendix/parity.md`` describes the environment. Then, from the root of this repository::
 
     python -m tests.parity.lotus_reference --authors Lotus --out tests/parity/fixtures/lotus.npz
 
@@ -37,7 +37,7 @@ def loud(vae):
 
 def image_u8(case: str) -> np.ndarray:
     """``(H, W, 3)`` uint8."""
-    return authors.picture(f"lotus/{case}/image", CASES[case][1])
+    return authors.image(f"lotus/{case}/image", CASES[case][1])
 
 
 def drawn(case: str, what: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -73,10 +73,10 @@ def run_case(case: str) -> dict[str, np.ndarray]:
     )
     pipe.set_progress_bar_config(disable=True)
 
-    told, outputs, decoded = {}, [], []
+    reported, outputs, decoded = {}, [], []
 
     def spy(module, arguments, options, output):
-        told["input"], told["prompt"] = arguments[0], options["encoder_hidden_states"]
+        reported["input"], reported["prompt"] = arguments[0], options["encoder_hidden_states"]
         outputs.append(output[0])
 
     pipe.unet.register_forward_hook(spy, with_kwargs=True)
@@ -107,8 +107,8 @@ def run_case(case: str) -> dict[str, np.ndarray]:
         **start,
     ).images[0]
     return {
-        "image_latent": told["input"][0, :4].numpy(),
-        "prompt": told["prompt"][0].numpy(),
+        "image_latent": reported["input"][0, :4].numpy(),
+        "prompt": reported["prompt"][0].numpy(),
         "network_output": outputs[0][0].numpy(),
         "unclipped": keep((decoded[0][0].mean(dim=1)[0] / 2 + 0.5).numpy()),
         "final": keep(final.mean(axis=-1)),

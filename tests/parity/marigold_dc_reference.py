@@ -43,7 +43,7 @@ def build(pipeline: type[MarigoldDepthPipeline]) -> Any:
 
 def image_u8(case: str) -> np.ndarray:
     """``(H, W, 3)`` uint8."""
-    return authors.picture(f"marigold_dc/{case}/image", CASES[case][0])
+    return authors.image(f"marigold_dc/{case}/image", CASES[case][0])
 
 
 def sparse_depth(case: str) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Run Marigold V2's own step on a tiny Qwen-Image with named weights, and keep slices of what it computes.
 
-``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/appendix/parity.md`` describes the environment. Then, from the root of this repository::
 
     python -m tests.parity.marigold_v2_reference --authors marigold-v2 \
         --out tests/parity/fixtures/marigold_v2.npz
@@ -52,7 +52,7 @@ CHECKPOINTS = {
 }
 
 
-def picture() -> torch.Tensor:
+def image() -> torch.Tensor:
     """``(1, 3, 48, 64)`` in [-1, 1]."""
     return torch.from_numpy(np.clip(0.4 * draw("image", (1, 3, *SIZE)), -1, 1))
 
@@ -168,7 +168,7 @@ def run_case(checkout: Path, name: str, dtype: torch.dtype, drawn: float) -> dic
             graph.torch = _Torch("torch")
         step = graph.QwenImageEdit2509Step({"prefix": PREFIX})
     vae_module.randn_tensor = lambda shape, dtype=None, **_: drawn * posterior(tuple(shape)).to(dtype)
-    batch = {"rgb_norm": picture(), "out": {}}
+    batch = {"rgb_norm": image(), "out": {}}
     graph.QwenImageEncode()(batch)
     image_latent = batch["out"]["lat_encoding"]
     step(batch)

@@ -2,7 +2,7 @@
 
 Used on both sides of every parity fixture, ours and (copied into the throw-away environment) the authors'.
 Needs numpy and torch only. Every parameter and floating buffer is drawn, also those that are initialised to
-zero: a network whose last layer is zero answers zero, and parity with it would say nothing.
+zero: a network whose last layer is zero answers zero, and parity with it would be meaningless.
 """
 
 import zlib
@@ -37,7 +37,7 @@ def fill(
 
     Args:
         module: gets the weights.
-        prefix: before every name, to tell networks apart (``"unet."``).
+        prefix: before every name, to distinguish networks (``"unet."``).
         rename: from the module's names to the shared ones, where the two sides differ.
         seed: of the draw.
     """

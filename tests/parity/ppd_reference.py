@@ -1,6 +1,6 @@
 """Run the authors' Pixel-Perfect Depth on named weights, and keep slices of what it answers.
 
-``docs/how-to/parity.md`` tells how to make the environment; then, from the root of this repository::
+``docs/appendix/parity.md`` describes the environment. Then, from the root of this repository::
 
     python -m tests.parity.ppd_reference --authors pixel-perfect-depth --out tests/parity/fixtures/ppd.npz
 
@@ -26,12 +26,12 @@ STEPS = 4
 MIDDLE = 500
 COUNTS = (1, 2, 3, 4, 5, 7, 10, 20, 50)
 #: One of more and one of less pixels than 1024 x 768.
-PHOTOGRAPHS = {"large": (900, 1300), "small": (75, 113)}
-#: Two parts of a map; of a resized photograph every 97th pixel. A few kB in all.
+PHOTOS = {"large": (900, 1300), "small": (75, 113)}
+#: Two parts of a map; of a resized image every 97th pixel. A few kB in all.
 CORNERS = ((slice(None), slice(None), slice(0, 12), slice(0, 12)), (..., slice(30, 42), slice(66, 78)))
 
 
-def picture() -> torch.Tensor:
+def image() -> torch.Tensor:
     """``(1, 3, 48, 80)`` in [0, 1]."""
     return torch.from_numpy(np.clip(0.5 + 0.2 * draw("image", (1, 3, *SIZE)), 0, 1))
 
@@ -41,9 +41,9 @@ def noise() -> torch.Tensor:
     return torch.from_numpy(draw("noise", (1, 1, *SIZE)))
 
 
-def photograph(kind: str) -> np.ndarray:
+def photo(kind: str) -> np.ndarray:
     """``(H, W, 3)`` uint8, RGB, smooth with some noise."""
-    height, width = PHOTOGRAPHS[kind]
+    height, width = PHOTOS[kind]
     rows, columns = np.mgrid[:height, :width][..., None]
     waves = 90 * np.sin(rows / 9.0 + np.arange(3)) * np.cos(columns / 13.0)
     return np.clip(128 + waves + 8 * draw(kind, (height, width, 3)), 0, 255).astype(np.uint8)
@@ -119,17 +119,17 @@ def run_authors(folder: Path) -> dict[str, np.ndarray]:
     from ppd.utils.transform import image2tensor, resize_keep_aspect
 
     model, kept = authors_model(), {}
-    semantics = model.semantics_prompt(picture())
-    joined = torch.cat([noise(), picture() - 0.5], dim=1)
+    semantics = model.semantics_prompt(image())
+    joined = torch.cat([noise(), image() - 0.5], dim=1)
     kept["semantics"] = semantics[:, :, ::64].numpy()
     kept["velocity"] = corners(model.dit(x=joined, semantics=semantics, timestep=torch.tensor(MIDDLE)))
     drawn, torch.randn = torch.randn, lambda size: noise()
-    kept["final"] = corners(model.forward_test(picture()))
+    kept["final"] = corners(model.forward_test(image()))
     torch.randn = drawn
     for count in COUNTS:
         kept[f"timesteps_{count}"] = Timesteps(1000, count).timesteps.numpy()
-    for kind in PHOTOGRAPHS:
-        resized = image2tensor(resize_keep_aspect(photograph(kind)[:, :, ::-1].copy()))
+    for kind in PHOTOS:
+        resized = image2tensor(resize_keep_aspect(photo(kind)[:, :, ::-1].copy()))
         kept[f"{kind}_size"] = np.array(resized.shape[-2:])
         kept[kind] = resized[:, :, ::97, ::97].numpy()
     return kept

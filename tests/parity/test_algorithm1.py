@@ -30,9 +30,7 @@ def test_scale_shift_and_latents_of_every_step(make_pipeline, turned):
 
     out = pipe(
         Image.fromarray(pair.left),
-        guidance=GeometryGuidance.paper(
-            pair.right, pair.K, pair.E, step_latents=RATE, step_affine=RATE_AFFINE
-        ),
+        guidance=GeometryGuidance.paper(pair.right, pair.K, pair.E, lr_latents=RATE, lr_affine=RATE_AFFINE),
         num_inference_steps=STEPS,
         latents=z,
         callback_on_step_end=watch,

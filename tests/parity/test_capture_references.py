@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,19 +11,21 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import Capture
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.capture.agreement import agreed, rendered, seen_in
-from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.transforms import nerf_pose
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.pose.multiview import SolvedCapture, _scaled
+from geodiff_plugin.pose.multiview import SolvedCapture, _rescale
 from geodiff_plugin.pose.tracks import grey_image, grey_views
-from geodiff_plugin.result.indicators import measure_indicators
-from geodiff_plugin.result.misfit import expected_error
+from geodiff_plugin.result.expected_error import expected_error
+from geodiff_plugin.result.median import _upsampled
 from geodiff_plugin.result.output import MetricDepthOutput, _in_the_priors_metres
-from geodiff_plugin.result.voting import _enlarged
-from geodiff_plugin.types import CameraView, DepthFrame, PosedViews
+from geodiff_plugin.trust import Call, KnownPoints, ResultStage, measure_result
+from geodiff_plugin.trust.match_statistics import match_statistics
+from geodiff_plugin.types import DepthFrame
+from tests.views import posed_frame, posed_of
 
 K = np.array([[400.0, 0.0, 159.5], [0.0, 410.0, 119.5], [0.0, 0.0, 1.0]])
 
@@ -43,7 +44,7 @@ def poses(count: int) -> np.ndarray:
 
 
 def test_a_solve_comes_back_to_the_given_frame_from_any_other():
-    """The solve of a made-up capture is the truth in another world: 1.7 times as small, turned and moved."""
+    """The solve of a synthetic capture is ground truth in another world: scaled, rotated and translated."""
     true, points = poses(9), np.random.default_rng(0).uniform((-2, -2, 3), (2, 2, 8), (40, 3))
     R, t = Rotation.from_euler("xyz", [20.0, -35.0, 50.0], degrees=True).as_matrix(), np.array([3.0, -1, 2])
     moved = true.copy()
@@ -53,20 +54,20 @@ def test_a_solve_comes_back_to_the_given_frame_from_any_other():
         "solved", moved, true, np.tile(K, (9, 1, 1)), np.ones(9, bool), points @ R.T / 1.7 + t, seen
     )
     depths = [dict(enumerate(((points - E[:3, 3]) @ E[:3, 2]).tolist())) for E in true]
-    found = _scaled(solved, depths, [{k: z / 1.7 for k, z in of.items()} for of in depths])
+    found = _rescale(solved, depths, [{k: z / 1.7 for k, z in of.items()} for of in depths])
     np.testing.assert_allclose(found.E, true, atol=1e-9)
     np.testing.assert_allclose(found.points, points, atol=1e-9)
     assert found.scale_depth == pytest.approx(1.7) and found.scale_trajectory == pytest.approx(1.7)
-    assert found.scale_spread == pytest.approx((0.015**-2 + 0.02**-2) ** -0.5, rel=1e-3)
-    # The depth of the scene says 1.3 times as much: the mean by the inverse variances.
-    torn = _scaled(solved, depths, [{k: z / 1.7 / 1.3 for k, z in of.items()} for of in depths])
-    shares = np.array([0.015, 0.02]) ** -2.0
-    shares /= shares.sum()
-    longer = math.exp(shares[0] * math.log(1.3))
+    assert found.scale_rel_std == pytest.approx((0.015**-2 + 0.02**-2) ** -0.5, rel=1e-3)
+    # The depth of the scene gives 1.3 times as much: the mean by the inverse variances.
+    torn = _rescale(solved, depths, [{k: z / 1.7 / 1.3 for k, z in of.items()} for of in depths])
+    fractions = np.array([0.015, 0.02]) ** -2.0
+    fractions /= fractions.sum()
+    longer = math.exp(fractions[0] * math.log(1.3))
     apart = np.linalg.norm(np.diff(torn.E[:, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(apart, longer * np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1))
-    assert torn.scale_spread == pytest.approx(
-        math.hypot(math.sqrt(shares[0] * shares[1]) * math.log(1.3), found.scale_spread), rel=1e-3
+    assert torn.scale_rel_std == pytest.approx(
+        math.hypot(math.sqrt(fractions[0] * fractions[1]) * math.log(1.3), found.scale_rel_std), rel=1e-3
     )
 
 
@@ -99,12 +100,12 @@ def test_everything_of_a_capture_is_rescaled_together(tmp_path):
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(("shift", "lost"), [(-0.4, None), (-0.6, 0), (0.4, None), (0.6, -1)])
-def test_a_point_is_in_a_picture_up_to_the_outer_edges_of_its_pixels(axis, shift, lost):
+def test_a_point_is_in_an_image_up_to_the_outer_edges_of_its_pixels(axis, shift, lost):
     """Another camera at the same place, whose principal point lies part of a pixel further on."""
     depth, E = np.full((5, 7), 2.0), poses(3)[1]
     moved = K_SMALL.copy()
     moved[axis, 2] += shift
-    frame, other = (DepthFrame("", depth, np.ones_like(depth), each, E) for each in (K_SMALL, moved))
+    frame, other = (posed_frame("", depth, np.ones_like(depth), each, E) for each in (K_SMALL, moved))
     expected = np.ones(depth.shape, bool)
     if lost is not None:
         expected[(slice(None), lost) if axis == 0 else lost] = False
@@ -157,7 +158,7 @@ def test_a_depth_and_that_of_other_frames_agree_as_written(sure, others, moving)
 
     def frame(depth: float, confidence: float) -> DepthFrame:
         full = np.full((7, 9), depth)
-        return DepthFrame("", full, np.full_like(full, confidence), K_SMALL, poses(3)[1])
+        return posed_frame("", full, np.full_like(full, confidence), K_SMALL, poses(3)[1])
 
     found = agreed(frame(2.0, sure), [frame(*each) for each in others], moving)
     expected = _agreed(2.0, sure, others, moving)
@@ -168,12 +169,12 @@ def test_a_depth_and_that_of_other_frames_agree_as_written(sure, others, moving)
 
 
 def test_frames_that_outvote_a_depth_observe_it_though_they_do_not_see_its_point():
-    """A wall at 4 m, which one frame has at 0.5 m: there its points are outside of the others' pictures."""
+    """A wall at 4 m, which one frame has at 0.5 m: there its points are outside of the others' images."""
 
     def frame(depth: float, x: float) -> DepthFrame:
         full, E = np.full((7, 9), depth), np.eye(4)
         E[0, 3] = x
-        return DepthFrame("", full, np.full_like(full, 0.5), K_SMALL, E)
+        return posed_frame("", full, np.full_like(full, 0.5), K_SMALL, E)
 
     found = agreed(
         replace(frame(0.5, 0.0), confidence=np.full((7, 9), 0.1)), [frame(4.0, 0.8), frame(4.0, -0.8)]
@@ -188,8 +189,8 @@ def test_of_several_points_of_a_finer_frame_a_pixel_shows_the_nearest():
     finer = np.diag([3.0, 3.0, 1.0]) @ K_SMALL
     depth = np.full((21, 27), 3.0)
     depth[:, 2::3] = 2.0
-    other = DepthFrame("", depth, np.ones_like(depth), finer, np.eye(4))
-    frame = DepthFrame("", np.full((7, 9), 5.0), np.ones((7, 9)), K_SMALL, np.eye(4))
+    other = posed_frame("", depth, np.ones_like(depth), finer, np.eye(4))
+    frame = posed_frame("", np.full((7, 9), 5.0), np.ones((7, 9)), K_SMALL, np.eye(4))
     seen, values = rendered(other, frame, np.where(depth < 2.5, 7, 1))
     assert (seen[:, 1:] == 2.0).all() and (values[:, 1:] == 7).all()
 
@@ -214,17 +215,16 @@ def test_points_that_three_frames_see_are_known_depths_of_each_in_its_camera(tmp
     assert capture.known_depths("3", "tracks") is None  # the solve does not hold it
 
 
-def test_a_shrunk_picture_keeps_every_ray_and_right_views_are_as_fine_as_the_left():
+def test_a_reduced_image_keeps_every_ray_and_right_views_have_the_same_resolution():
     image = torch.rand(3, 240, 320)
-    _, shrunk = grey_image(image, torch.from_numpy(K), 0.25)
+    shrunk = grey_image(image, Camera(K), 0.25).camera
     # The middle of the first pixel's block of 4 x 4 is at (1.5, 1.5).
-    np.testing.assert_allclose(np.linalg.solve(shrunk, [0, 0, 1]), np.linalg.solve(K, [1.5, 1.5, 1]))
+    np.testing.assert_allclose(np.linalg.solve(shrunk.K, [0, 0, 1]), np.linalg.solve(K, [1.5, 1.5, 1]))
     finer = K.copy()
     finer[:2] *= 2.0
-    right = CameraView(torch.rand(3, 480, 640), torch.from_numpy(finer), torch.eye(4))
-    views = grey_views(PosedViews(image, (right,), torch.from_numpy(K)))
-    assert [grey.shape for grey, _ in views] == [(240, 320), (240, 320)]
-    assert views[1][1][0, 0] == pytest.approx(views[0][1][0, 0])
+    left, right = grey_views(posed_of(image, K, (torch.rand(3, 480, 640), finer, np.eye(4))))
+    assert left.grey.shape == right.grey.shape == (240, 320)
+    assert right.camera.K[0, 0] == pytest.approx(left.camera.K[0, 0])
 
 
 def test_disparity_of_depth_is_what_both_cameras_see():
@@ -277,7 +277,7 @@ def test_expected_error_is_a_quarter_pixel_over_the_change_of_the_right_pixel_wi
 
     moves = np.linalg.norm(right_px(depth + step) - right_px(depth - step), axis=-1) / (2 * step)
     np.testing.assert_allclose(expected_error(depth, small, [E]), 0.25 / moves, rtol=1e-5)
-    both = expected_error(depth, small, [E], scale_spread=0.1)
+    both = expected_error(depth, small, [E], scale_rel_std=0.1)
     np.testing.assert_allclose(both, np.hypot(0.25 / moves, 0.1 * depth), rtol=1e-5)
 
 
@@ -285,15 +285,10 @@ def _matches(inverse_depth: np.ndarray, confidence: np.ndarray, step: float) -> 
     def tensor(x: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(x.astype(np.float32))[None]
 
-    return SimpleNamespace(
-        inverse_depth=tensor(inverse_depth),
-        confidence=tensor(confidence),
-        plane_step=torch.tensor(step),
-        size=inverse_depth.shape,
-    )
+    return Matches(tensor(inverse_depth), tensor(confidence), torch.tensor(step))
 
 
-def test_indicators_of_matches_and_points_against_numpy():
+def test_statistics_of_matches_and_points_against_numpy():
     rng, step = np.random.default_rng(0), 0.001
     inverse = rng.uniform(0.1, 1.0, (24, 32))
     confidence = rng.uniform(0.0, 1.0, inverse.shape)
@@ -302,25 +297,25 @@ def test_indicators_of_matches_and_points_against_numpy():
     known[2::5, 2::5] = 1.0
     smooth = np.full(inverse.shape, 0.5)
     matches = _matches(inverse, confidence, step)
-    native = PosedViews(torch.zeros(3, 24, 32), (), torch.eye(3))
-    evidence = Evidence(native, native, None, matches)
-    numbers = measure_indicators(evidence, torch.from_numpy(depth)[None, None].float(), False)
+    numbers = match_statistics(matches, torch.from_numpy(depth)[None, None].float())
     sure = confidence > 0.5
     assert float(numbers["matched"]) == pytest.approx(sure.mean())
-    assert float(numbers["off_matches"]) == pytest.approx(
+    assert float(numbers["log_deviation"]) == pytest.approx(
         np.sort(np.abs(np.log(depth * inverse)[sure]))[(sure.sum() - 1) // 2], rel=1e-4
     )
     low, high = np.quantile(inverse[sure], (0.05, 0.95))
-    assert float(numbers["spread"]) == pytest.approx(np.log(high / low), rel=1e-4)
-    assert float(numbers["scene_m"]) == pytest.approx(1.0 / np.median(inverse[sure]), rel=2e-2)
+    assert float(numbers["log_range"]) == pytest.approx(np.log(high / low), rel=1e-4)
+    assert float(numbers["median_m"]) == pytest.approx(1.0 / np.median(inverse[sure]), rel=2e-2)
     # Points 1.15 times as far as the matches, a third of them 1.25 times.
     far = np.where(np.arange(inverse.size).reshape(inverse.shape) % 3, 1.15, 1.25)
     points = _matches(smooth / far, known, step)
-    compared = Evidence(native, native, None, _matches(smooth, np.ones_like(smooth), step), points)
-    numbers = measure_indicators(compared, torch.full((1, 1, 24, 32), 2.0), False)
-    assert float(numbers["points_ratio"]) == pytest.approx(1.15, rel=1e-4)
-    assert float(numbers["points_off"]) == pytest.approx((far[known > 0] > 1.2).mean())
-    assert float(numbers["points"]) == known.sum() and float(numbers["points_compared"]) == known.sum()
+    native = posed_of(torch.zeros(3, 24, 32), np.eye(3))
+    matches = _matches(smooth, np.ones_like(smooth), step)
+    stage = ResultStage(Call(), native, matches, points, torch.full((1, 1, 24, 32), 2.0))
+    found = measure_result(stage)[KnownPoints]
+    assert found.ratio == pytest.approx(1.15, rel=1e-4)
+    assert found.fraction_off == pytest.approx((far[known > 0] > 1.2).mean())
+    assert found.count == KnownPoints.scalars(stage)["compared"] == known.sum()
 
 
 def test_enlarged_votes_lie_where_the_pixels_do():
@@ -328,7 +323,7 @@ def test_enlarged_votes_lie_where_the_pixels_do():
     rows, columns, factor = 8, 10, 4
     v, u = np.indices((rows, columns), dtype=np.float32)
     voted = torch.from_numpy(0.01 * u + 0.02 * v)
-    found = _enlarged(voted, torch.zeros(3, rows, columns), torch.zeros(3, rows * factor, columns * factor))
+    found = _upsampled(voted, torch.zeros(3, rows, columns), torch.zeros(3, rows * factor, columns * factor))
     y, x = (np.indices((rows * factor, columns * factor)) + 0.5) / factor - 0.5
     inner = slice(6, -6)
     off = found.numpy()[inner, inner] - (0.01 * x + 0.02 * y)[inner, inner]

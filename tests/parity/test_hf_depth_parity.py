@@ -35,13 +35,13 @@ ROUNDING = 1.2 / 255  # half a grey level after either axis, and the second one 
 
 
 @pytest.fixture(scope="module")
-def photograph() -> np.ndarray:
+def image() -> np.ndarray:
     """``(75, 113, 3)`` uint8, mid-grey: what the library cuts off at 0 and 255 is not what is compared."""
     return np.random.default_rng(0).integers(90, 160, (75, 113, 3), dtype=np.uint8)
 
 
-def as_tensor(photograph: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(photograph).permute(2, 0, 1)[None] / 255.0
+def as_tensor(image: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(image).permute(2, 0, 1)[None] / 255.0
 
 
 def made(kind: str) -> tuple:
@@ -53,11 +53,11 @@ def made(kind: str) -> tuple:
 
 
 @pytest.mark.parametrize("name", PROCESSORS)
-def test_preparation(name, photograph):
+def test_preparation(name, image):
     processor = PROCESSORS[name]
-    theirs = processor(photograph, return_tensors="pt")["pixel_values"]
+    theirs = processor(image, return_tensors="pt")["pixel_values"]
     preparation = Preparation(processor.to_dict())
-    ours = preparation(as_tensor(photograph))
+    ours = preparation(as_tensor(image))
     deviation = min(preparation.options["image_std"]) if preparation.options["do_normalize"] else 1.0
     # They round to bytes after either axis; ZoeDepth and what is not resized are never rounded.
     exact = "zoedepth" in name or "dinov2" in name
@@ -65,13 +65,13 @@ def test_preparation(name, photograph):
 
 
 @pytest.mark.parametrize("kind", ["depth_anything", "dpt", "glpn"])
-def test_map(kind, photograph):
+def test_map(kind, image):
     model, preparation, pipe = made(kind)
     processor = (GLPNImageProcessorPil if kind == "glpn" else DPTImageProcessorPil)()
     with torch.no_grad():
-        output = model(pixel_values=preparation(as_tensor(photograph)))
-    theirs = processor.post_process_depth_estimation(output, [photograph.shape[:2]])[0]["predicted_depth"]
-    ours = pipe.predict(as_tensor(photograph), photograph.shape[:2])
+        output = model(pixel_values=preparation(as_tensor(image)))
+    theirs = processor.post_process_depth_estimation(output, [image.shape[:2]])[0]["predicted_depth"]
+    ours = pipe.predict(as_tensor(image), image.shape[:2])
     assert theirs.std() > 0
     torch.testing.assert_close(ours[0, 0], theirs, rtol=0, atol=1e-6)
 
@@ -92,15 +92,15 @@ def theirs_without_torchvision(kind: str, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["depth_pro", "prompt_depth_anything", "tipsv2"])
 @torch.no_grad()
-def test_metres_by_the_librarys_own_ending(kind, photograph, monkeypatch):
-    (model, preparation, pipe), told = made(kind), {}
+def test_metres_by_the_librarys_own_ending(kind, image, monkeypatch):
+    (model, preparation, pipe), reported = made(kind), {}
     if kind == "prompt_depth_anything":
-        told["prompt_depth"] = torch.rand(1, 1, 12, 16) * 3 + 1
-    output = model(pixel_values=preparation(as_tensor(photograph)), **told)
+        reported["prompt_depth"] = torch.rand(1, 1, 12, 16) * 3 + 1
+    output = model(pixel_values=preparation(as_tensor(image)), **reported)
     ending = theirs_without_torchvision(
         {"tipsv2": "tipsv2_dpt"}.get(kind, kind), monkeypatch
     ).post_process_depth_estimation
-    theirs = ending(SimpleNamespace(resample=2), output, [photograph.shape[:2]])[0]["predicted_depth"]
-    ours = pipe.metres(pipe.predict(as_tensor(photograph), photograph.shape[:2], told.get("prompt_depth")))
+    theirs = ending(SimpleNamespace(resample=2), output, [image.shape[:2]])[0]["predicted_depth"]
+    ours = pipe.metres(pipe.predict(as_tensor(image), image.shape[:2], reported.get("prompt_depth")))
     assert theirs.std() > 0
     torch.testing.assert_close(ours[0, 0], theirs, rtol=1e-5, atol=1e-5)

@@ -60,12 +60,12 @@ def converted(downloads, name, dtype=torch.float32):
 @torch.no_grad()
 def compare(pipe, theirs, label):
     """Latents, unclipped map (theirs is about [-1, 1], ours about [0, 1]) and final map, which it gives."""
-    told = pipe.prepare_condition(reference.picture().to(pipe.dtype), 1, 1, None)
+    reported = pipe.prepare_condition(reference.image().to(pipe.dtype), 1, 1, None)
     call = {"processing_resolution": 0, "output_type": "pt", "output_latent": True}
-    out = pipe(reference.picture() / 2 + 0.5, **call)
+    out = pipe(reference.image() / 2 + 0.5, **call)
     unclipped, final = 2 * pipe.decode(out.latent) - 1, 2 * out.prediction.float() - 1
     for name, ours in (
-        ("image_latent", reference.keep_latent(told["image_latent"][0])),
+        ("image_latent", reference.keep_latent(reported["image_latent"][0])),
         ("z0", reference.keep_latent(out.latent[0])),
         ("unclipped", reference.keep(unclipped[0, 0])),
         ("final", reference.keep(final[0, 0])),
@@ -92,10 +92,10 @@ def test_the_fixture_shows_checkpoints_and_clipping(theirs):
 def test_the_mode_equals_theirs_and_bfloat16_behaves(downloads, theirs):
     exact = compare(converted(downloads, "Log-stage2"), theirs, "mode")
     pipe = converted(downloads, "Log-stage2", torch.bfloat16)
-    out = pipe(reference.picture() / 2 + 0.5, processing_resolution=0, output_type="pt")
+    out = pipe(reference.image() / 2 + 0.5, processing_resolution=0, output_type="pt")
     own = (2 * out.prediction.float() - 1 - exact).abs()[0, 0, ::5, ::5].numpy()
     authors = np.abs(theirs["bfloat16/final"] - theirs["mode/final"])
     assert own.mean() < 1.5 * authors.mean() and own.mean() < 0.05 * theirs["mode/final"].std()
     pipe.set_timesteps(1, torch.device("cpu"))
-    told = (pipe.scheduler.timesteps[0] / 1000).to(torch.bfloat16)
-    assert told == 0.5 == torch.full((), 499.0, dtype=torch.bfloat16) / 1000  # as theirs comes out
+    reported = (pipe.scheduler.timesteps[0] / 1000).to(torch.bfloat16)
+    assert reported == 0.5 == torch.full((), 499.0, dtype=torch.bfloat16) / 1000  # as theirs comes out

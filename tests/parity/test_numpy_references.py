@@ -7,17 +7,17 @@ import pytest
 import torch
 from kornia.geometry.depth import warp_frame_depth
 
-from geodiff_plugin.algorithm import correction
+from geodiff_plugin.algorithm import match_fitting
 from geodiff_plugin.algorithm.terms import photometric_map
+from geodiff_plugin.cameras import Camera, PosedViews
 from geodiff_plugin.config import DEFAULT
-from geodiff_plugin.geometry import project_rays, rays_of, warp_right_to_left
+from geodiff_plugin.geometry import plane_rays, project_rays, warp_right_to_left
 from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.census import census, census_cost, grey_levels
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import sweep_planes
 from geodiff_plugin.matching.winner import winner
 from geodiff_plugin.scale.volume_search import group_pixels, look_up
-from geodiff_plugin.types import CameraView, PosedViews
 from tests.golden.parts import scene, volume
 
 
@@ -78,21 +78,21 @@ def test_a_winner_is_the_plane_of_least_sum_with_its_evidence():
             offset = np.roots(np.polyder(np.polyfit((-1, 0, 1), total[k - 1 : k + 2], 2)))[0]
         assert found.position[y, x].item() == pytest.approx(k + np.clip(offset, -0.5, 0.5), abs=1e-5)
         assert found.best[y, x] == total[k]
-        assert found.runner_up[y, x] == total[np.abs(np.arange(planes) - k) > 1].min()
+        assert found.second_best[y, x] == total[np.abs(np.arange(planes) - k) > 1].min()
         gain = max(0.0, level[seen[:, y, x]].mean() - level[k]) / 224
         assert found.gain[y, x].item() == pytest.approx(gain, abs=1e-6)
         beside = level[max(k - 4, 0)] / 2 + level[min(k + 4, planes - 1)] / 2
         assert found.sharpness[y, x].item() == pytest.approx((beside - level[k]) / 224, abs=1e-6)
 
 
-def test_a_plane_costs_what_the_views_that_see_the_pixel_say():
-    left, _, K, views = scene()
-    grey = left.mean(0, keepdim=True)
-    rights = [
-        CameraView(view.image_01.mean(0, keepdim=True), view.K, view.T_right_from_left) for view in views
-    ]
+def test_the_cost_of_a_plane_is_from_the_views_that_see_the_pixel():
+    coloured, _ = scene()
+    left, *rights = (
+        view._replace(image_01=view.image_01.mean(0, keepdim=True))
+        for view in (coloured.left, *coloured.rights)
+    )
     planes = torch.linspace(0.01, 0.4, 20)
-    given = (PosedViews(grey, views, K) for views in (rights[:1], rights[1:], rights))
+    given = (PosedViews(left, tuple(views)) for views in (rights[:1], rights[1:], rights))
     one, other, both = (sweep_planes(posed, planes) for posed in given)
     seen = np.stack([one.in_view, other.in_view])
     assert all(seen[k][~seen[1 - k]].any() for k in (0, 1)) and (~seen).all(0).any()
@@ -113,9 +113,9 @@ def test_a_candidate_costs_the_mean_of_what_is_in_view():
     parts = np.split(np.argsort(x), range(each, len(at), each))
     assert each > 1 and len(parts) == len(groups.mean)
     depth = 1.5 + 12 * _random(4, len(parts))
-    found, share = look_up(groups, made.inverse_depth, torch.from_numpy(depth).float())
+    found, fraction = look_up(groups, made.inverse_depth, torch.from_numpy(depth).float())
     np.testing.assert_allclose(groups.mean, [x[part].mean() for part in parts], rtol=1e-5)
-    for row, mean, seen in zip(depth, found, share, strict=True):
+    for row, mean, seen in zip(depth, found, fraction, strict=True):
         total, count = 0.0, 0.0
         for part, z in zip(parts, row, strict=True):
             position = (1 / z - planes[0]) / (planes[1] - planes[0])
@@ -165,10 +165,10 @@ class Fit:
         self.inverse[rng.random(rows.shape) < 0.05] *= 2
         self.left = rng.random((3, 1, 1)) + 0.3 * (columns > 12) + 0.05 * rng.random((3, *rows.shape))
         self.step = 0.004
-        self.noise = np.hypot(self.step / self.inverse, DEFAULT.match_noise)
-        self.weight = self.confidence * (DEFAULT.match_noise / self.noise) ** 2
+        self.noise = np.hypot(self.step / self.inverse, DEFAULT.match_sigma)
+        self.weight = self.confidence * (DEFAULT.match_sigma / self.noise) ** 2
         self.residual = np.where(self.weight > 0, np.log(self.inverse * self.depth), 0)
-        self.correct_share = (self.weight * self.confidence).sum() / self.weight.sum()
+        self.correct_fraction = (self.weight * self.confidence).sum() / self.weight.sum()
         scale = self.width / 512
         self.edges = []  # the two ends of every link, and its strength
         index = np.arange(rows.size).reshape(rows.shape)
@@ -187,14 +187,14 @@ class Fit:
         )
         return depth, Matches(inverse, confidence, torch.tensor([self.step])), left
 
-    def solve(self, data, weight, smoothness, inertia, robust, rounds):
+    def solve(self, data, weight, smoothness, tikhonov, robust, rounds):
         """The field of reweighted least squares, and the weights of another round."""
         laplacian = np.zeros((data.size, data.size))
         for i, j, strength in self.edges:
             laplacian[[i, j], [i, j]] += strength
             laplacian[[i, j], [j, i]] -= strength
         for _ in range(rounds):
-            matrix = np.diag((weight + inertia).ravel()) + smoothness * laplacian
+            matrix = np.diag((weight + tikhonov).ravel()) + smoothness * laplacian
             field = np.linalg.solve(matrix, (weight * data).ravel()).reshape(data.shape)
             weight = robust(field - data)
         return field, weight
@@ -203,24 +203,24 @@ class Fit:
         """The field over wide regions."""
 
         def robust(left_over):
-            return weight / (1 + left_over**2 / (DEFAULT.outlier_width**2 * (self.noise**2 + error**2)))
+            return weight / (1 + left_over**2 / (DEFAULT.outlier_sigma**2 * (self.noise**2 + error**2)))
 
         return self.solve(self.residual, weight, 400.0, 1.3e-3 * 400, robust, 3)[0]
 
     def spread(self, residual):
         """Standard deviation of residuals beyond the noise, by the 80 % quantile of right matches."""
-        largest = self.quantile(np.abs(residual), 0.8 * self.correct_share)
+        largest = self.quantile(np.abs(residual), 0.8 * self.correct_fraction)
         return np.sqrt(max((largest / 1.2816) ** 2 - self.quantile(self.noise, 0.5) ** 2 / 4, 0))
 
-    def quantile(self, values, share):
+    def quantile(self, values, fraction):
         order = np.argsort(values.ravel())
         below = np.cumsum(self.weight.ravel()[order])
-        return values.ravel()[order][np.searchsorted(below, share * below[-1])]
+        return values.ravel()[order][np.searchsorted(below, fraction * below[-1])]
 
 
 @pytest.fixture
 def fit(monkeypatch) -> Fit:
-    monkeypatch.setattr(correction, "SOLVER_STEPS", 60)  # exact, as a dense solver
+    monkeypatch.setattr(match_fitting, "SOLVER_STEPS", 60)  # exact, as a dense solver
     return Fit()
 
 
@@ -233,13 +233,13 @@ def test_the_error_of_a_prior_is_what_other_blocks_of_matches_do_not_predict(fit
     expected = fit.spread(np.where(black > 0, of_white, of_black) - fit.residual)
     depth, target, left = fit.torch()
     assert 0.02 < expected < 0.4
-    assert float(correction.prior_error(depth, target, left)) == pytest.approx(expected, rel=1e-3)
+    assert float(match_fitting.prior_error(depth, target, left)) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("error", [0.03, 0.07])
 def test_a_correction_is_three_passes_of_weighted_least_squares(fit, error):
     broad = fit.stiff(fit.weight, error)
-    doubted = (broad - fit.residual) ** 2 / (DEFAULT.outlier_width**2 * (fit.noise**2 + error**2))
+    doubted = (broad - fit.residual) ** 2 / (DEFAULT.outlier_sigma**2 * (fit.noise**2 + error**2))
     trusted = fit.weight / (1 + doubted)
 
     def robust(left_over):
@@ -249,12 +249,12 @@ def test_a_correction_is_three_passes_of_weighted_least_squares(fit, error):
     first, total, weight = max(last, 50), np.zeros_like(fit.residual), trusted
     for k in range(3):
         least = 1e-4 ** (1 - k / 2) * 5e-4 ** (k / 2)
-        inertia = max(min(0.015 * (0.05 / error) ** 4, 0.03), least)
+        tikhonov = max(min(0.015 * (0.05 / error) ** 4, 0.03), least)
         smoothness = first ** (1 - k / 2) * last ** (k / 2)
-        part, weight = fit.solve(fit.residual - total, weight, smoothness, inertia, robust, 2)
+        part, weight = fit.solve(fit.residual - total, weight, smoothness, tikhonov, robust, 2)
         total += part
     depth, target, left = fit.torch()
-    refined, _, field = correction.fit_depth(depth, target, left, torch.full((1, 1, 1, 1), error))
+    refined, _, field = match_fitting.fit_depth(depth, target, left, torch.full((1, 1, 1, 1), error))
     np.testing.assert_allclose(field[0, 0], total, atol=5e-4)
     np.testing.assert_allclose(refined[0, 0], fit.depth * np.exp(-total), rtol=1e-3)
 
@@ -265,15 +265,17 @@ def test_warp_equals_kornia(angle, at):
     generator = torch.Generator().manual_seed(0)
     right = torch.rand(2, 3, 20, 28, generator=generator, dtype=torch.float64)
     depth = 1.5 + torch.rand(2, 1, 20, 28, generator=generator, dtype=torch.float64)
-    K = torch.tensor([[25.0, 0, 13.2], [0, 26.0, 9.7], [0, 0, 1]], dtype=torch.float64).expand(2, 3, 3)
+    K = torch.tensor([[25.0, 0, 13.2], [0, 26.0, 9.7], [0, 0, 1]], dtype=torch.float64)
     T = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     T[:, 0, 0] = T[:, 2, 2] = math.cos(angle)
     T[:, 0, 2], T[:, 2, 0] = math.sin(angle), -math.sin(angle)
     T[:, :3, 3] = torch.tensor(at, dtype=torch.float64)
-    ours = warp_right_to_left(right, depth, K, K, T)
-    theirs = warp_frame_depth(right, depth, T, K)
+    camera = Camera(K.numpy())
+    rays = plane_rays(depth, [camera] * 2, [camera] * 2, T.numpy())
+    ours = warp_right_to_left(right, depth, rays)
+    theirs = warp_frame_depth(right, depth, T, K.expand(2, 3, 3))
     # kornia blends the last hundredth of a pixel before the edge with zeros, where we repeat the edge
-    u, v = project_rays(depth, rays_of(depth, K, K, T))[0].unbind(-1)
+    u, v = project_rays(depth, rays)[0].unbind(-1)
     inside = (u >= 0) & (u <= 27) & (v >= 0) & (v <= 19)
     visible = (ours.visible & inside[:, None]).expand_as(right)
     assert 0.3 < visible.double().mean() < 1.0

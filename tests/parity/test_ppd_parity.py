@@ -82,14 +82,14 @@ def pipe(folder):
 
 @torch.no_grad()
 def test_network_and_final_output_equal_the_authors(pipe, theirs):
-    tokens = semantic_tokens(pipe.semantic_encoder, reference.picture())
+    tokens = semantic_tokens(pipe.semantic_encoder, reference.image())
     np.testing.assert_allclose(tokens[:, :, ::64], theirs["semantics"], **TOLERANCE)
-    condition = {"image": reference.picture() - 0.5, "semantics": tokens}
+    condition = {"image": reference.image() - 0.5, "semantics": tokens}
     velocity = pipe.denoise(reference.noise(), torch.tensor(float(reference.MIDDLE)), condition)
     np.testing.assert_allclose(reference.corners(velocity), theirs["velocity"], **TOLERANCE)
     assert theirs["velocity"].std() > 0.5  # their initialisation would answer 0 everywhere
     call = {"num_inference_steps": reference.STEPS, "processing_resolution": 0, "latents": reference.noise()}
-    out = pipe(reference.picture(), **call, output_type="pt", output_latent=True)
+    out = pipe(reference.image(), **call, output_type="pt", output_latent=True)
     for map_01 in (out.prediction, pipe.decode(out.latent)):
         np.testing.assert_allclose(reference.corners(map_01), theirs["final"], **TOLERANCE)
 
@@ -102,11 +102,11 @@ def test_timesteps_equal_the_authors(pipe, theirs, count):
     assert len(sampling_timesteps(29)) == 29  # theirs are 30, the last one -1
 
 
-@pytest.mark.parametrize("kind", reference.PHOTOGRAPHS)
+@pytest.mark.parametrize("kind", reference.PHOTOS)
 def test_resizing_equals_the_authors_but_for_their_rounding(theirs, kind):
     processor = AreaImageProcessor(vae_scale_factor=16)
-    resized, padding, size = processor.preprocess(Image.fromarray(reference.photograph(kind)), 1024)
-    assert padding == (0, 0) and tuple(size) == reference.PHOTOGRAPHS[kind]
+    resized, padding, size = processor.preprocess(Image.fromarray(reference.photo(kind)), 1024)
+    assert padding == (0, 0) and tuple(size) == reference.PHOTOS[kind]
     assert tuple(resized.shape[-2:]) == tuple(theirs[f"{kind}_size"])
     np.testing.assert_allclose(resized[:, :, ::97, ::97] / 2 + 0.5, theirs[kind], rtol=0, atol=1.01 / 255)
 
@@ -120,11 +120,11 @@ def test_weights_that_do_not_fit_are_listed(folder, tmp_path):
     shapes = {k: tuple(small.get(n, n) for n in v) for k, v in reference.semantic_shapes().items()}
     del shapes["pretrained.blocks.0.ls1.gamma"]
     save_encoder(tmp_path / "encoder", shapes)
-    for checkpoint, told, sentence in (
+    for checkpoint, reported, sentence in (
         (tmp_path / "ppd.pth", encoder, "missing: blocks.1.mlp.fc2.bias; unexpected: blocks.0.attn.extra"),
         (folder / "ppd.pth", tmp_path / "encoder", "layer_scale1"),
         (folder / "ppd.pth", None, "Depth-Anything-V2-Large-hf"),
     ):
         with pytest.raises(ValueError, match=re.escape(sentence)):
-            run_convert([checkpoint, tmp_path / "out"], told and str(told))
+            run_convert([checkpoint, tmp_path / "out"], reported and str(reported))
         assert not (tmp_path / "out").exists()

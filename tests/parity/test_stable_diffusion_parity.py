@@ -71,13 +71,13 @@ def depthfm(tmp_path_factory):
 
 
 @torch.no_grad()
-def depthfm_call(pipe, members: int, **told):
+def depthfm_call(pipe, members: int, **reported):
     image = torch.from_numpy(depthfm_reference.image_u8()).permute(2, 0, 1)[None] / 127.5 - 1
     latents = pipe.image_latents(image, members, members)
     start = pipe.add_noise(latents, depthfm_reference.noise(tuple(latents.shape)))
     call = {"num_inference_steps": depthfm_reference.STEPS, "processing_resolution": 0, "latents": start}
-    picture = Image.fromarray(depthfm_reference.image_u8())
-    return start, pipe(picture, **call, ensemble_size=members, batch_size=members, **told)
+    rgb = Image.fromarray(depthfm_reference.image_u8())
+    return start, pipe(rgb, **call, ensemble_size=members, batch_size=members, **reported)
 
 
 def test_depthfm_equals_the_authors_code(depthfm):
@@ -149,13 +149,13 @@ def make_geowizard(case: str) -> GeoWizardPipeline:
     width, _ = reference.CASES[case]
     if case.startswith("v1"):
         encoder = CLIPVisionModelWithProjection(CLIPVisionConfig(**reference.VISION))
-        told = {"image_encoder": fill(encoder, "image_encoder.").eval()}
+        reported = {"image_encoder": fill(encoder, "image_encoder.").eval()}
     else:
         encoder = fill(CLIPTextModel(CLIPTextConfig(**reference.TEXT)), "text_encoder.").eval()
-        told = {"text_encoder": encoder, "tokenizer": make_tokenizer(string.ascii_lowercase)}
+        reported = {"text_encoder": encoder, "tokenizer": make_tokenizer(string.ascii_lowercase)}
     unet = UNet2DConditionModel(**reference.UNET, projection_class_embeddings_input_dim=width)
     networks = fill(unet, "unet.").eval(), fill(AutoencoderKL(**reference.VAE), "vae.").eval()
-    return quiet(GeoWizardPipeline(*networks, DDIMScheduler(**reference.SCHEDULER), **told))
+    return quiet(GeoWizardPipeline(*networks, DDIMScheduler(**reference.SCHEDULER), **reported))
 
 
 @pytest.mark.parametrize("case", geowizard_reference.CASES)
@@ -183,7 +183,7 @@ def test_geowizard_equals_the_authors_code(case):
         unclipped = pipe.decode(depth)[0, 0] * 2.0 - 1.0
         assert unclipped.abs().max() > 1.0, "a case in which nothing is clipped says nothing"
         same(unclipped[::8, ::8], theirs[f"{case}/depth_unclipped"])
-        same(pipe.decode_picture(normals)[0, :, ::8, ::8], theirs[f"{case}/normals_unscaled"])
+        same(pipe.decode_image(normals)[0, :, ::8, ::8], theirs[f"{case}/normals_unscaled"])
     same(output.prediction[0, ::8, ::8, 0], theirs[f"{case}/depth"])
     normals = output.extras["normals"][0]  # (H, W, 3); theirs are the opposite vectors
     same(-normals[::8, ::8].transpose(2, 0, 1), theirs[f"{case}/normals"])
@@ -199,9 +199,9 @@ def test_geowizards_depth_and_normals_are_coupled():
         torch.from_numpy(geowizard_reference.noise()),
         geowizard_reference.UNET["cross_attention_dim"],
     )
-    told = {"prompt": torch.ones(1, 1, width), "class_labels": torch.ones(1, 2, 10)}
+    reported = {"prompt": torch.ones(1, 1, width), "class_labels": torch.ones(1, 2, 10)}
     latents = noise.repeat(1, 2, 1, 1).requires_grad_()
-    output = pipe.denoise(latents, torch.tensor(500), {"image_latent": noise, **told})
+    output = pipe.denoise(latents, torch.tensor(500), {"image_latent": noise, **reported})
     halves = pipe.depth_channels, pipe.normal_channels
     for answer, question in (halves, halves[::-1]):
         (gradient,) = torch.autograd.grad(output[:, answer].square().sum(), latents, retain_graph=True)

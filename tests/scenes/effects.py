@@ -50,7 +50,7 @@ def sample_effects(rng: np.random.Generator, size: tuple[int, int], grey: float 
 
     Args:
         rng: source of randomness.
-        size: ``(H, W)``; a small image is a photograph scaled down, with less blur and noise left.
+        size: ``(H, W)``; a small image is an image scaled down, with less blur and noise left.
         grey: share of grey images.
     """
     scale = min(1.0, max(size) / 320)
@@ -89,11 +89,11 @@ def indoor_cameras(seed: int) -> tuple[CameraEffects, CameraEffects]:
 
 
 def _blurred(image: torch.Tensor, sigma: float) -> torch.Tensor:
-    reach = max(1, min(int(np.ceil(2.5 * sigma)), min(image.shape[-2:]) - 1))
-    x = torch.arange(-reach, reach + 1, device=image.device, dtype=image.dtype)
+    radius = max(1, min(int(np.ceil(2.5 * sigma)), min(image.shape[-2:]) - 1))
+    x = torch.arange(-radius, radius + 1, device=image.device, dtype=image.dtype)
     kernel = torch.exp(-(x * x) / (2 * sigma * sigma))
     kernel = kernel / kernel.sum()
-    out = F.pad(image[:, None], (reach, reach, reach, reach), mode="replicate")
+    out = F.pad(image[:, None], (radius, radius, radius, radius), mode="replicate")
     out = F.conv2d(out, kernel.view(1, 1, 1, -1))
     return F.conv2d(out, kernel.view(1, 1, -1, 1))[:, 0]
 

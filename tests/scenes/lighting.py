@@ -79,8 +79,8 @@ def sky_radiance(light: Lighting, atlas: Atlas, scene: torch.Tensor, direction: 
     mix = 1 - (1 - up).pow(3)
     zenith, horizon, cloud = (params[:, k : k + 3].t()[..., None] for k in (0, 3, 6))
     base = horizon + (zenith - horizon) * mix
-    reach = 0.12 / (up + 0.12)
-    uv = torch.stack([direction[0] * reach, direction[2] * reach]).flatten(1)
+    radius = 0.12 / (up + 0.12)
+    uv = torch.stack([direction[0] * radius, direction[2] * radius]).flatten(1)
     layer = torch.full_like(uv[0], LAYERS["clouds"], dtype=torch.int64)
     soft = sample_atlas(atlas, layer, uv, torch.full_like(uv[0], 0.004))[:, 0].reshape(up.shape)
     amount = (soft * params[:, 9, None] * (up * 6).clamp_max(1)).clamp(0, 1)

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from geodiff_plugin.app.form import PAIRS_FOLDER as FOLDER
+from geodiff_plugin.app.job import PAIRS_FOLDER as FOLDER
 from tests.scenes import render_pair
 
 __all__ = ["render_examples"]

@@ -1,7 +1,7 @@
 """Rendering of the demo pair: ``python -m tests.scenes.make_pair [--out DIR]``.
 
 Data flow: a seed -> two images, Middlebury calibration, depth in millimetres.
-Paper: none; it stands in for the photographs of S5, which may not be shipped.
+Paper: none; it stands in for the images of S5, which may not be shipped.
 """
 
 from __future__ import annotations

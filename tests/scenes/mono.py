@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from tests.scenes.cameras import intrinsics
 from tests.scenes.effects import CameraEffects, apply_effects, sample_effects
 from tests.scenes.layouts import sample_scene
-from tests.scenes.photographs import cover_with_photographs
+from tests.scenes.photos import cover_with_photos
 from tests.scenes.render import expose, render_linear, soften
 from tests.scenes.scene import Camera, Scene
 from tests.scenes.visibility import in_sight
@@ -26,22 +26,22 @@ _SIGHT_MARGIN_M = 1.5
 
 
 def _chunk(size: tuple[int, int], device: torch.device) -> int:
-    """Scenes to render at once: a GPU wants many, a CPU's cache wants few."""
+    """Return the number of scenes to render at once: many on a GPU, few for the cache of a CPU."""
     if device.type == "cpu":
         return 2 if size[0] * size[1] < 20_000 else 1
     return max(1, (1 << 21) // (size[0] * size[1]))
 
 
 def _draw(
-    seed: int, kind: str | None, size: tuple[int, int], photographs: float
+    seed: int, kind: str | None, size: tuple[int, int], photos: float
 ) -> tuple[Scene, Camera, np.random.Generator]:
-    """A scene without what is out of sight, a camera with a drawn lens, the rest of the randomness."""
+    """Sample a scene without invisible parts, a camera with a random lens, and a random generator."""
     scene, rng = sample_scene(seed, kind), np.random.default_rng([seed, 22])
     fov = float(np.clip(scene.fov_deg * np.exp(rng.normal(0, 0.12)), 30, 95))
     camera = Camera(intrinsics(size, fov), scene.T_world_from_camera)
     scene = in_sight(scene, [(camera, size)], _SIGHT_MARGIN_M)
-    if photographs > 0 and rng.random() < 0.5:
-        scene = cover_with_photographs(scene, rng, photographs)
+    if photos > 0 and rng.random() < 0.5:
+        scene = cover_with_photos(scene, rng, photos)
     return scene, camera, rng
 
 
@@ -51,24 +51,24 @@ def render_mono(
     device: str | torch.device = "cpu",
     augment: bool = True,
     kind: str | None = None,
-    photographs: float = 0.0,
+    photos: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render one view of each seed's scene: a training batch.
+    """Render a training batch: one view of each seed's scene.
 
     Args:
-        seeds: ``N`` non-negative integers; each decides kind, scene, lens and camera effects.
+        seeds: ``N`` non-negative integers; each determines kind, scene, lens and camera effects.
         size: ``(H, W)``; any aspect ratio.
-        device: where to render and where the result lives.
-        augment: apply drawn camera effects (exposure, noise, blur, JPEG, grey and so on).
-        kind: one of ``KINDS`` for all; None draws one for each seed.
-        photographs: share of the surfaces that show a photograph, in half of the scenes; needs scikit-image.
+        device: device of the rendering and of the result.
+        augment: apply random camera effects (exposure, noise, blur, JPEG, grey and so on).
+        kind: one of ``KINDS`` for all seeds; ``None`` samples one per seed.
+        photos: fraction of the surfaces that show a photo, in half of the scenes; needs scikit-image.
 
     Returns:
         images ``(N, 3, H, W)`` float32 in [0, 1] and depth ``(N, 1, H, W)`` metres, ``inf`` for the sky.
 
     Raises:
-        ValueError: no seeds, a negative one, or an unknown kind.
-        ImportError: photographs without scikit-image.
+        ValueError: no seeds, a negative seed, or an unknown kind.
+        ImportError: ``photos`` above 0 without scikit-image.
     """
     seeds = [int(s) for s in seeds]
     if not seeds:
@@ -77,8 +77,8 @@ def render_mono(
     images, depths = [], []
     for start in range(0, len(seeds), chunk):
         part = seeds[start : start + chunk]
-        scenes, cameras, rngs = zip(*(_draw(s, kind, size, photographs) for s in part), strict=True)
-        linear = render_linear(scenes, cameras, range(len(part)), size, device, photographs > 0)
+        scenes, cameras, rngs = zip(*(_draw(s, kind, size, photos) for s in part), strict=True)
+        linear = render_linear(scenes, cameras, range(len(part)), size, device, photos > 0)
         effects = [sample_effects(rng, size) if augment else CameraEffects() for rng in rngs]
         _, gain = expose(linear.radiance)
         image, _ = expose(linear.radiance, gain * torch.tensor([e.gain for e in effects], device=gain.device))

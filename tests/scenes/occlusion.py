@@ -48,8 +48,8 @@ def openness(
     away = upper - middle[..., None]
     spread = ((away * away).sum(0) * weight).amax(-1).sqrt() + heights[1][:, 0]
     d2, _, radius, opaque = candidates(world, scene, middle, None)
-    reach = radius + spread[:, None]
-    keep = (d2 <= reach * reach) & (radius > 0) & opaque & live.any(-1)[:, None]
+    extent = radius + spread[:, None]
+    keep = (d2 <= extent * extent) & (radius > 0) & opaque & live.any(-1)[:, None]
     b, n = keep.nonzero(as_tuple=True)
     prim = scene[b] * world.centre.shape[1] + n
     turn = world.turn[prim]  # (pairs, 3, 4) world to local, in metres

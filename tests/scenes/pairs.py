@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.geometry import resize_intrinsics
+from geodiff_plugin import cameras
+from geodiff_plugin._internal.checks import bad_value
 from tests.scenes.builder import rotation
 from tests.scenes.cameras import intrinsics
 from tests.scenes.effects import CameraEffects, apply_effects, sample_effects
@@ -108,7 +108,7 @@ def render_pair(
         effects: True draws noise, blur and the like for both cameras; or give them.
 
     Returns:
-        The pair; things that the right camera would stand in are left out of the scene.
+        The pair; objects that contain the right camera are removed from the scene.
 
     Raises:
         ValueError: unknown kind, negative seed, ``baseline_m <= 0``, or an ``E`` that is not ``(4, 4)``.
@@ -129,7 +129,8 @@ def render_pair(
     if K_right is not None:
         right_K = torch.as_tensor(K_right).double()
     elif K_left is not None:
-        right_K = resize_intrinsics(left_K[None], size, size_right)[0]
+        left = cameras.Camera(left_K.numpy(), size[::-1])
+        right_K = torch.from_numpy(left.resized(size_right[::-1]).K)
     else:
         right_K = intrinsics(size_right, scene.fov_deg)
     world_from_right = scene.T_world_from_camera.double() @ E_

@@ -26,8 +26,8 @@ def hit_box(o: _Rays, d: _Rays, taper: torch.Tensor) -> torch.Tensor:
     near = far = None
     for axis in range(3):
         inverse = _nonzero(d[axis]).reciprocal()
-        middle, reach = -o[axis] * inverse, inverse.abs()
-        low, high = middle - reach, middle + reach
+        middle, extent = -o[axis] * inverse, inverse.abs()
+        low, high = middle - extent, middle + extent
         near = low if near is None else torch.maximum(near, low)
         far = high if far is None else torch.minimum(far, high)
     return near.masked_fill((near >= far) | (near <= 0), _INF)

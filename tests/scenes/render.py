@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 import torch.nn.functional as F
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from tests.scenes.cameras import TILE, camera_rays, tile, untile
 from tests.scenes.lighting import Lighting, unit
 from tests.scenes.scene import Camera, RenderedView, Scene
@@ -35,7 +35,7 @@ class LinearViews:
         radiance: ``(V, 3, H, W)`` linear.
         depth_m: ``(V, 1, H, W)``, inf for the sky.
         material: ``(V, 1, H, W)`` int64.
-        edges: ``(V, 1, H, W)`` bool, pixels beside one of another primitive.
+        edges: ``(V, 1, H, W)`` bool, pixels next to one of another primitive.
     """
 
     radiance: torch.Tensor
@@ -120,7 +120,7 @@ def render_linear(
     owner: Sequence[int],
     size: tuple[int, int],
     device: str | torch.device = "cpu",
-    photographs: bool = False,
+    images: bool = False,
     antialias: bool = False,
 ) -> LinearViews:
     """Radiance and depth of a batch of views.
@@ -131,12 +131,10 @@ def render_linear(
         owner: ``V`` indices, the scene that each camera looks at.
         size: ``(H, W)`` pixels, the same for all.
         device: where to render.
-        photographs: the scenes use photographs as textures.
+        images: whether the scenes use photos as textures.
         antialias: shade pixels on outlines four times. Depth is always that of the pixel's centre.
     """
-    stage = _Stage(
-        World.gather(scenes, device), Lighting.gather(scenes, device), atlas(str(device), photographs)
-    )
+    stage = _Stage(World.gather(scenes, device), Lighting.gather(scenes, device), atlas(str(device), images))
     rays, pixel, steps = camera_rays(cameras, torch.as_tensor(owner), size, device, _FAR)
     radiance, t, prim, material = _follow(stage, rays, pixel)
     views = len(cameras)

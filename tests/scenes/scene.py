@@ -65,7 +65,7 @@ class Scene:
         centre: ``(N, 3)`` centre of the bounding sphere, its radius in ``radius`` ``(N,)``.
         radius: ``(N,)``.
         material: ``(N,)`` int64, a ``Material``.
-        layer: ``(N,)`` int64, index into ``textures.LAYERS`` (or a photograph after them).
+        layer: ``(N,)`` int64, index into ``textures.LAYERS`` (or an image after them).
         tile_m: ``(N, 2)`` metres that one texture tile covers along u and v.
         tile_offset: ``(N, 2)`` in tiles.
         palette: ``(N, 3, 3)`` colours A, B and accent C.

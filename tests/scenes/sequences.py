@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin._internal.checks import bad_value, check_number
 from tests.scenes.builder import rotation
 from tests.scenes.cameras import intrinsics
 from tests.scenes.layouts import sample_scene

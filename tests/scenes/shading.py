@@ -56,7 +56,7 @@ def _albedo(atlas: Atlas, row: torch.Tensor, uv_m: torch.Tensor, footprint_m: to
     colour = colour + (c - colour) * texel[1]
     shade = texel[3] * (1 + row[34] * (broad - 0.5) * 1.6)
     colour = colour * shade
-    if atlas.photographs:
+    if atlas.images:
         photo = layer >= atlas.photo_from
         colour = torch.where(photo, texel[:3] * (0.4 + 1.2 * a), colour)
         return colour, torch.where(photo, torch.zeros_like(shade), texel[2])
@@ -77,7 +77,7 @@ def _surface_rows(world: World, prim: torch.Tensor, point: torch.Tensor, directi
 
 
 def _specular(material: torch.Tensor, gloss: torch.Tensor, cosine: torch.Tensor, live: torch.Tensor):
-    """Shares of the radiance that a reflection and what lies behind glass contribute."""
+    """Fractions of the radiance that a reflection and what lies behind glass contribute."""
     fresnel = (1 - cosine).pow(4)
     is_mirror, is_glass = material == int(Material.MIRROR), material == int(Material.GLASS)
     mirror = ((gloss - 0.3).clamp_min(0) * (0.15 + 0.7 * fresnel) - 0.035).clamp_min(0)

@@ -10,6 +10,8 @@ from tests.contracts.test_datasets import photometric_error
 from tests.scenes import render_sequence
 from tests.scenes.dataset import is_reflective
 
+pytestmark = pytest.mark.end_to_end
+
 
 def test_synthetic_pairs_are_seeded_and_alternate(tmp_path):
     with pytest.raises(ValueError, match="sides of at least 1 pixel"):
@@ -40,7 +42,7 @@ def test_reflective_pairs_show_mirrors_or_glass():
 
 
 @pytest.mark.parametrize("seed", [0, 1], ids=["rectified", "posed"])
-def test_rendered_truth_warps_right_to_left(seed):
+def test_rendered_ground_truth_warps_right_to_left(seed):
     (ref,) = find_pairs(Path(f"synthetic:1+{seed}"))
     sample = load(SampleRef(ref.dataset, ref.name, ref.files | {"size": (96, 128)}))
     true, nearer, farther = (photometric_error(sample, factor) for factor in (1.0, 0.8, 1.2))
@@ -66,4 +68,4 @@ def test_frames_show_one_scene_from_a_moving_rig():
         if 0 <= round(u) < 64 and 0 <= round(v) < 48 and point[2] > 0:
             there = float(sequence.lefts[1].depth_m[0, round(v), round(u)])
             agree.append(abs(there / point[2] - 1) < 0.03)
-    assert len(agree) > 1000 and np.mean(agree) > 0.75  # the rest is hidden there, or beside an edge
+    assert len(agree) > 1000 and np.mean(agree) > 0.75  # the rest is hidden there, or next to an edge

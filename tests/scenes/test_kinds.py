@@ -27,7 +27,7 @@ def rendered():
 
 def test_kinds_are_the_table():
     assert KINDS == ("room", "street", "tabletop", "corridor", "terrain")
-    assert set(LAYOUTS) == {*KINDS, "plain"}
+    assert set(LAYOUTS) == {*KINDS, "plain", "repeated"}
     assert {sample_scene(seed).kind for seed in range(40)} == set(KINDS)
 
 
@@ -74,7 +74,7 @@ def test_camera_stands_in_nothing(kind):
         assert eye[1] < 0  # above the ground
 
 
-@pytest.mark.parametrize("kind", ["room", "corridor", "tabletop", "plain"])
+@pytest.mark.parametrize("kind", ["room", "corridor", "tabletop", "plain", "repeated"])
 def test_indoors_is_closed(kind, rendered):
     for seed in SEEDS:
         assert rendered[kind, seed][1].valid.all()

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.geometry import warp_right_to_left
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.geometry import plane_rays, warp_right_to_left
 from tests.scenes import CameraEffects, Material, render_mono, render_pair
 from tests.scenes.cameras import intrinsics
+
+pytestmark = pytest.mark.end_to_end
 
 SIZE = (72, 96)
 
@@ -16,10 +19,9 @@ SIZE = (72, 96)
 def warped(pair):
     """The right image on the left grid, by the exact depth, and where it should agree."""
     depth = pair.left.depth_m.clamp(max=1e4)[None]
-    T = torch.linalg.inv(pair.E)[None].float()
-    w = warp_right_to_left(
-        pair.right.image_01[None], depth, pair.K_left[None].float(), pair.K_right[None].float(), T
-    )
+    cameras = (Camera(K.numpy()) for K in (pair.K_left, pair.K_right))
+    rays = plane_rays(depth, *([camera] for camera in cameras), [np.linalg.inv(pair.E)])
+    w = warp_right_to_left(pair.right.image_01[None], depth, rays)
     seen = pair.in_view & ~pair.occluded & pair.left.valid & w.visible[0]
     seen &= pair.left.material == int(Material.DIFFUSE)
     return w.image[0], seen
@@ -175,6 +177,6 @@ def test_gpu_and_cpu_agree(kind):
 def test_a_right_image_of_another_size_has_the_left_camera_at_that_size():
     K = torch.tensor([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
     pair = render_pair(0, "room", (48, 64), K_left=K, size_right=(96, 128))
-    # Twice as many pixels; the middle of the picture stays its middle.
+    # Twice as many pixels; the middle of the image stays its middle.
     twice = torch.tensor([[200.0, 0.0, 63.5], [0.0, 200.0, 47.5], [0.0, 0.0, 1.0]])
     torch.testing.assert_close(pair.K_right, twice.double())

@@ -17,7 +17,7 @@ from tests.scenes.layouts.ground import crossing, drives, parcels, repairs
 from tests.scenes.layouts.plants import thicket
 from tests.scenes.layouts.spot import Spot, camera_pose
 from tests.scenes.patterns import LAYERS, TEXELS, bake_layer
-from tests.scenes.photographs import PHOTOGRAPHS, cover_with_photographs
+from tests.scenes.photos import PHOTOS, cover_with_photos
 from tests.scenes.render import expose, render_linear, soften
 from tests.scenes.scene import Scene, Shape
 from tests.scenes.textures import atlas, sample_atlas
@@ -180,7 +180,7 @@ def test_tiles_round_trip():
     assert torch.equal(untile(tile(x), 2, (21, 30)), x)
 
 
-def test_render_views_refuses_nonsense():
+def test_render_views_rejects_nonsense():
     scene = sample_scene(0, "room")
     with pytest.raises(ValueError, match="views must be a list of at least one Camera"):
         render_views(scene, [])
@@ -220,21 +220,21 @@ def test_every_layer_is_in_range(name):
     assert texels[..., 3].mean() > 0.1
 
 
-def test_photographs_only_on_request_and_never_the_benchmark_pair():
-    assert not any("motorcycle" in name for name in PHOTOGRAPHS)
+def test_real_images_only_on_request_and_never_the_benchmark_pair():
+    assert not any("motorcycle" in name for name in PHOTOS)
     scene = sample_scene(0, "room")
     assert int(scene.layer.max()) < len(LAYERS)
-    covered = cover_with_photographs(scene, np.random.default_rng(0), 0.5)
-    share = (covered.layer >= len(LAYERS)).float().mean()
-    assert 0.3 < share < 0.6
+    covered = cover_with_photos(scene, np.random.default_rng(0), 0.5)
+    fraction = (covered.layer >= len(LAYERS)).float().mean()
+    assert 0.3 < fraction < 0.6
     assert torch.equal(covered.world_to_local, scene.world_to_local)
 
 
-def test_photographs_render():
+def test_image_textures_render():
     pytest.importorskip("skimage")
     scene = scene_of(lambda b: b.box((0, 0, 3), (4, 4, 0.1), GREY))
-    scene = cover_with_photographs(scene, np.random.default_rng(0), 1.0)
-    view = render_linear([scene], [Camera(K, torch.eye(4))], [0], SIZE, photographs=True)
+    scene = cover_with_photos(scene, np.random.default_rng(0), 1.0)
+    view = render_linear([scene], [Camera(K, torch.eye(4))], [0], SIZE, images=True)
     assert torch.isfinite(view.radiance).all()
     assert view.radiance.std() > 0.01
 

@@ -26,15 +26,15 @@ class Atlas:
         texels: ``(M, 4)`` float32: tone between colours A and B, accent, gloss, shade; or r, g, b, 1.
         level_start: ``(levels,)`` int64, first row of each mip level.
         levels: number of mip levels; level ``k`` has ``TEXELS >> k`` texels a side.
-        photo_from: layers from this index on are photographs.
-        photographs: there are any.
+        photo_from: index of the first layer with a photo.
+        images: whether there are photos.
     """
 
     texels: torch.Tensor
     level_start: torch.Tensor
     levels: int
     photo_from: int
-    photographs: bool
+    images: bool
 
 
 def _pyramid(base: np.ndarray) -> list[np.ndarray]:
@@ -46,23 +46,23 @@ def _pyramid(base: np.ndarray) -> list[np.ndarray]:
 
 
 @lru_cache(maxsize=4)
-def atlas(device: str = "cpu", photographs: bool = False) -> Atlas:
+def atlas(device: str = "cpu", images: bool = False) -> Atlas:
     """The baked atlas, made on the CPU and cached per device.
 
     Args:
         device: where the table lives.
-        photographs: append the photographs that scikit-image bundles (training only).
+        images: append the photos that scikit-image bundles (training only).
     """
     layers = [bake_layer(name, i) for i, name in enumerate(LAYERS)]
-    if photographs:
-        from tests.scenes.photographs import photograph_layers
+    if images:
+        from tests.scenes.photos import photo_layers
 
-        layers += list(photograph_layers())
+        layers += list(photo_layers())
     levels = _pyramid(np.stack(layers).astype(np.float32))
     flat = np.concatenate([x.reshape(-1, 4) for x in levels])
     start = np.cumsum([0] + [x.shape[0] * x.shape[1] * x.shape[2] for x in levels[:-1]])
     rows, starts = torch.from_numpy(flat).to(device), torch.from_numpy(start).to(device)
-    return Atlas(rows, starts, len(levels), len(LAYERS), photographs)
+    return Atlas(rows, starts, len(levels), len(LAYERS), images)
 
 
 def sample_atlas(

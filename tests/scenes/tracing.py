@@ -97,10 +97,10 @@ def _pairs(world: World, rays: Bundles, casters: bool) -> tuple[torch.Tensor, to
     b, n = keep.nonzero(as_tuple=True)
     # Second look: the cone's axis against the oriented box, inflated by the cone's width at the far side.
     prim = rays.scene[b] * world.centre.shape[1] + n
-    reach = torch.minimum(d2[b, n].sqrt() + radius[b, n], length[b])
+    half_size = torch.minimum(d2[b, n].sqrt() + radius[b, n], length[b])
     tangent = sin / cos.clamp_min(0.05)
     wide = (cos < 0.3)[b]
-    inflate = spread[b] + reach * tangent[b]
+    inflate = spread[b] + half_size * tangent[b]
     m = world.matrix[prim]
     o = (m[:, :, :3] * apex.t()[b][:, None]).sum(-1) + m[:, :, 3]
     d = (m[:, :, :3] * axis.t()[b][:, None]).sum(-1)
@@ -109,7 +109,7 @@ def _pairs(world: World, rays: Bundles, casters: bool) -> tuple[torch.Tensor, to
     inverse = d.reciprocal()
     middle, half = -o * inverse, bound * inverse.abs()
     near, far = (middle - half).amax(-1), (middle + half).amin(-1)
-    ok = ((near <= far) & (far >= 0) & (near <= reach)) | wide
+    ok = ((near <= far) & (far >= 0) & (near <= half_size)) | wide
     return b[ok], prim[ok]
 
 

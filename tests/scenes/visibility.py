@@ -62,18 +62,18 @@ def in_sight(scene: Scene, views: Sequence[tuple[Camera, tuple[int, int]]], marg
         margin_m: how far outside of the pyramid of view something may be and still be kept.
     """
     keep = scene.fixed
-    reach = scene.radius + margin_m
+    extent = scene.radius + margin_m
     for camera, (height, width) in views:
         pose, K = camera.T_world_from_camera.float(), camera.K
         p = (scene.centre - pose[:3, 3]) @ pose[:3, :3]
-        inside = p[:, 2] > -reach
+        inside = p[:, 2] > -extent
         for axis, pixels in ((0, width), (1, height)):
             # Distance to the two side planes, where the pixel coordinate is that of the edge; they need
             # not be symmetric, nor upright where K has a skew.
             for sign, edge in ((-1, -0.5), (1, pixels - 0.5)):
                 normal = sign * (K[axis].double() - K.new_tensor([0.0, 0.0, edge]).double())
                 normal = (normal / normal.norm()).to(p)
-                inside &= p @ normal < reach
+                inside &= p @ normal < extent
         keep = keep | inside
     return _select(scene, keep)
 

@@ -49,8 +49,8 @@ def _rendered(pose: bytes, size: tuple[int, int], camera: bytes) -> tuple[np.nda
     v, u = np.mgrid[: size[1], : size[0]]
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T @ E[:3, :3].T
     with np.errstate(divide="ignore"):
-        reach = np.where(rays > 0, HALF - E[:3, 3], -HALF - E[:3, 3]) / np.where(rays == 0, 1e-12, rays)
-    axis, depth = reach.argmin(-1), reach.min(-1)
+        radius = np.where(rays > 0, HALF - E[:3, 3], -HALF - E[:3, 3]) / np.where(rays == 0, 1e-12, rays)
+    axis, depth = radius.argmin(-1), radius.min(-1)
     points = E[:3, 3] + rays * depth[..., None]
     image = np.zeros((*depth.shape, 3), np.uint8)
     for wall in range(3):

@@ -5,7 +5,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin import geometry as g
+from geodiff_plugin.cameras import Camera
 
 SIZE = (24, 32)
 K = np.array([[31.0, 7.0, 14.2], [0.0, 28.0, 12.7], [0.0, 0.0, 1.0]])
@@ -43,6 +45,13 @@ def uv_of(points, K) -> np.ndarray:
     return seen[:2] / seen[2]
 
 
+def rays_of(depth_m: torch.Tensor, K_left, K_right, T) -> g.PlaneRays:
+    """The rays of one image, or of each of a batch."""
+    batch = (each.reshape(-1, *each.shape[-2:]) for each in (K_left, K_right, T))
+    K_left, K_right, T = batch
+    return g.plane_rays(depth_m, list(map(Camera, K_left)), list(map(Camera, K_right)), T)
+
+
 def last(x: torch.Tensor) -> np.ndarray:
     """``(1, H, W, C)`` as ``(C, H, W)``."""
     return x[0].permute(2, 0, 1).numpy()
@@ -59,57 +68,59 @@ def last(x: torch.Tensor) -> np.ndarray:
 )
 def test_projection_and_warp_are_the_definition(seed, pose, size_right):
     depth = 1.0 + 3.0 * np.random.default_rng(seed).random(SIZE)
-    T, K_r = T_of(**pose), g.resize_intrinsics(tensor(K_RIGHT), SIZE, size_right)[0].numpy()
+    T, right = T_of(**pose), Camera(K_RIGHT, SIZE[::-1]).resized(size_right[::-1])
     points = points_of(depth, K)
     in_right = np.einsum("ij,jhw->ihw", T[:3, :3], points) + T[:3, 3, None, None]
-    expected = uv_of(in_right, K_r)
-    cloud = g.unproject(tensor(depth)[None], tensor(K))
-    np.testing.assert_allclose(last(cloud), points, atol=1e-12)
-    moved = g.transform(cloud, tensor(T))
-    np.testing.assert_allclose(last(moved), in_right, atol=1e-12)
-    rays = g.plane_rays(tensor(K), tensor(K_r), tensor(T), SIZE)
-    for uv, z in (g.project(moved, tensor(K_r)), g.project_rays(tensor(depth)[None], rays)):
+    expected = uv_of(in_right, right.K)
+    depth_m = tensor(depth)[None]
+    rays = rays_of(depth_m, K, right.K, T)
+    moved = tensor(in_right).permute(0, 2, 3, 1)
+    for uv, z in (g.project(moved, right), g.project_rays(depth_m, rays)):
         np.testing.assert_allclose(last(uv), expected, atol=1e-9)
         np.testing.assert_allclose(z[0], in_right[2], atol=1e-12)
+    by_arrays, z = right.project(in_right.transpose(1, 2, 0))
+    np.testing.assert_allclose(by_arrays.transpose(2, 0, 1), expected, atol=1e-9)
+    np.testing.assert_allclose(z, in_right[2], atol=1e-12)
     # An image that is its own coordinates reads back the right pixel.
-    ramp = tensor(pixels(size_right)[:2])
-    for known in ({}, {"rays": rays}):
-        warped = g.warp_right_to_left(ramp, tensor(depth)[None], tensor(K), tensor(K_r), tensor(T), **known)
-        limits = np.array([size_right[1] - 1, size_right[0] - 1])[:, None, None]
-        inside = ((expected >= -0.01) & (expected <= limits + 0.01)).all(0)  # to a hundredth of a pixel
-        np.testing.assert_array_equal(warped.visible[0, 0], inside)
-        assert inside.mean() > 0.3
-        np.testing.assert_allclose(
-            warped.image[0].numpy()[:, inside], np.clip(expected, 0, limits)[:, inside], atol=1e-9
-        )
+    warped = g.warp_right_to_left(tensor(pixels(size_right)[:2]), depth_m, rays)
+    limits = np.array([size_right[1] - 1, size_right[0] - 1])[:, None, None]
+    inside = ((expected >= -0.01) & (expected <= limits + 0.01)).all(0)  # to a hundredth of a pixel
+    np.testing.assert_array_equal(warped.visible[0, 0], inside)
+    assert inside.mean() > 0.3
+    np.testing.assert_allclose(
+        warped.image[0].numpy()[:, inside], np.clip(expected, 0, limits)[:, inside], atol=1e-9
+    )
 
 
 def test_depth_at_and_behind_the_camera_is_finite_invisible_and_without_gradient():
     values = torch.tensor([2.0, 0.5, 0.25, 0.0, -1.0, 1e-9, 0.25 + 1e-12, 1e9])
     depth = values.repeat(1, 1, 4, 1).double().requires_grad_()
-    camera_8, ahead = tensor(camera(cx=3.5, cy=1.5)), tensor(T_of(at=(0.0, 0.0, 0.25)))
+    camera_8 = Camera(camera(cx=3.5, cy=1.5), (8, 4))
+
+    ahead = rays_of(depth, camera_8.K, camera_8.K, T_of(at=(0.0, 0.0, 0.25)))
     image = torch.rand(1, 1, 4, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    warped = g.warp_right_to_left(image, depth, camera_8, camera_8, ahead)
-    uv, _ = g.project(g.transform(g.unproject(depth, camera_8), ahead), camera_8)
-    by_rays, _ = g.project_rays(depth, g.rays_of(depth, camera_8, camera_8, ahead))
+    warped = g.warp_right_to_left(image, depth, ahead)
+    directions = tensor(points_of(np.ones((4, 8)), camera_8.K)).permute(0, 2, 3, 1)
+    uv, _ = g.project(directions * depth[:, 0, ..., None] - tensor([0.0, 0.0, 0.25]), camera_8)
+    by_rays, _ = g.project_rays(depth, ahead)
     (gradient,) = torch.autograd.grad(warped.image.sum() + by_rays.sum() + uv.sum(), depth)
     behind = values <= 0.25 + 1e-6
     assert all(torch.isfinite(x).all() for x in (warped.image, by_rays, uv, gradient))
     assert not warped.visible[..., behind].any() and (gradient[..., behind] == 0).all()
     assert warped.visible[..., 7].all()  # a point at infinity is seen
-    away = tensor(T_of(angle=np.pi))
-    assert not g.warp_right_to_left(image, depth.detach().abs() + 1, camera_8, camera_8, away).visible.any()
+    away = rays_of(depth, camera_8.K, camera_8.K, T_of(angle=np.pi))
+    assert not g.warp_right_to_left(image, depth.detach().abs() + 1, away).visible.any()
 
 
 @pytest.mark.parametrize("size_right", [(40, 60), (80, 120), (20, 30)])
-def test_a_near_square_hides_the_strip_beside_it(size_right):
+def test_a_near_square_occludes_the_strip_next_to_it(size_right):
     """Right camera at +x: the square shifts left by more than the wall, and covers a strip at its left."""
     size = (40, 60)
     depth = torch.full((1, 1, *size), 4.0)
     depth[..., 10:30, 25:40] = 2.0
-    wide = tensor(camera(40.0, 29.5, 19.5)).float()
-    K_right = g.resize_intrinsics(wide, size, size_right)
-    hidden = g.hidden_in_right(depth, wide, K_right, tensor(T_of(at=(0.6, 0, 0))).float(), size_right)[0, 0]
+    wide = Camera(camera(40.0, 29.5, 19.5), size[::-1])
+    rays = rays_of(depth, wide.K, wide.resized(size_right[::-1]).K, T_of(at=(0.6, 0, 0)))
+    hidden = g.occluded_in_right(depth, rays, size_right)[0, 0]
     # disparities 12 and 6 px: wall pixels u with u - 6 in [25 - 12, 40 - 12), that is columns 19..24
     expected = torch.zeros(size, dtype=torch.bool)
     expected[10:30, 19:25] = True
@@ -138,113 +149,22 @@ def batch(x) -> torch.Tensor:
 def test_every_image_of_a_batch_has_its_own_cameras():
     size_right = (30, 20)
     depth = 1.5 + 2.0 * np.random.default_rng(0).random((3, *SIZE))
-    K_left, K_r, T = map(batch, (BATCH_K, BATCH_K_RIGHT, BATCH_T))
     depth_m, ramp = batch(depth)[:, None], batch(pixels(size_right)[:2])[None].repeat(3, 1, 1, 1)
     ramp = ramp * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).view(3, 1, 1, 1)
-    cloud = g.unproject(depth_m, K_left)
-    moved = g.transform(cloud, T)
-    warped = g.warp_right_to_left(ramp, depth_m, K_left, K_r, T)
-    by_rays = g.project_rays(depth_m, g.rays_of(depth_m, K_left, K_r, T))
+    rays = rays_of(depth_m, BATCH_K, BATCH_K_RIGHT, BATCH_T)
+    warped = g.warp_right_to_left(ramp, depth_m, rays)
+    by_rays = g.project_rays(depth_m, rays)
     for b in range(3):
         points = points_of(depth[b], BATCH_K[b])
         in_right = np.einsum("ij,jhw->ihw", BATCH_T[b, :3, :3], points) + BATCH_T[b, :3, 3, None, None]
         expected = uv_of(in_right, BATCH_K_RIGHT[b])
-        np.testing.assert_allclose(cloud[b].permute(2, 0, 1), points, atol=1e-12)
-        np.testing.assert_allclose(moved[b].permute(2, 0, 1), in_right, atol=1e-12)
-        for uv, z in (g.project(moved, K_r), by_rays):
-            np.testing.assert_allclose(uv[b].permute(2, 0, 1), expected, atol=1e-9)
-            np.testing.assert_allclose(z[b], in_right[2], atol=1e-12)
+        np.testing.assert_allclose(by_rays[0][b].permute(2, 0, 1), expected, atol=1e-9)
+        np.testing.assert_allclose(by_rays[1][b], in_right[2], atol=1e-12)
         inside = ((expected >= 0) & (expected <= np.array([19, 29])[:, None, None])).all(0)
         assert 0.1 < inside.mean() < 1 and warped.visible[b, 0].numpy()[inside].all()
         np.testing.assert_allclose(
             warped.image[b].numpy()[:, inside], (b + 1) * expected[:, inside], atol=1e-9
         )
-
-
-def test_resized_intrinsics_project_where_the_resized_pixels_are():
-    """With a factor of its own for each axis, a skew, and the dtype that came."""
-    before, after = (24, 32), (60, 20)
-    point = np.array([0.3, -0.2, 1.7])
-    found = g.resize_intrinsics(torch.tensor(BATCH_K, dtype=torch.float32), before, after)
-    assert found.dtype == torch.float32 and found.shape == (3, 3, 3)
-    for matrix, resized in zip(BATCH_K, found.double().numpy(), strict=True):
-        (u, v, w), (u_new, v_new, w_new) = matrix @ point, resized @ point
-        assert u_new / w_new == pytest.approx((u / w + 0.5) * 20 / 32 - 0.5, abs=1e-5)
-        assert v_new / w_new == pytest.approx((v / w + 0.5) * 60 / 24 - 0.5, abs=1e-5)
-
-
-def test_cameras_that_are_being_optimised_are_decided_on_by_their_values():
-    left, right, T = (batch(each).requires_grad_() for each in (BATCH_K, BATCH_K_RIGHT, BATCH_T))
-    assert not g.is_rectified(left, right, T).any()
-    np.testing.assert_allclose(g.resize_intrinsics(left, SIZE, (12, 16))[:, 0, 0], BATCH_K[:, 0, 0] / 2)
-    image, _ = g.as_fine_as(torch.zeros(1, 40, 50), 2 * left[0], left[0])
-    assert image.shape == (1, 20, 25)
-
-
-def test_sizes_are_scaled_by_axis_and_bounded_by_one_factor():
-    assert g.scaled_size((100, 30), 0.25, 2.5) == (25, 75)
-    assert g.scaled_size((100, 30), 0.001, 0.01) == (1, 1)
-    assert g.size_within((300, 400), 120_000) == (300, 400) == g.size_within((300, 400), 10**9)
-    assert g.size_within((300, 400), 30_000) == (150, 200)
-    assert g.size_within((640, 480), 640 * 480 // 4 + 1) == (320, 240)
-    assert g.image_size(torch.zeros(2, 3, 5, 7)) == (5, 7)
-
-
-def test_a_resized_image_does_not_alias_and_keeps_its_camera():
-    stripes = torch.zeros(2, 24, 32)
-    stripes[0, :, ::2] = 1.0
-    stripes[1] = torch.arange(32.0)
-    image, camera_new = g.resize_image(stripes, tensor(K)[0], (12, 8))
-    assert image.shape == (2, 12, 8)
-    np.testing.assert_allclose(image[0, :, 1:-1], 0.5, atol=0.03)
-    np.testing.assert_allclose(image[1, 5, 1:-1], (np.arange(1, 7) + 0.5) * 4 - 0.5, atol=1e-4)
-    np.testing.assert_allclose(camera_new, g.resize_intrinsics(tensor(K), (24, 32), (12, 8))[0])
-    same, camera_same = g.resize_image(stripes, camera_new, (24, 32))
-    assert same is stripes and camera_same is camera_new
-
-
-@pytest.mark.parametrize(
-    ("focal", "size"),
-    [
-        ((31.0, 28.0), (24, 32)),
-        ((20.0, 28.0), (24, 32)),
-        ((62.0, 28.0), (24, 16)),
-        ((31.0, 84.0), (8, 32)),
-        ((124.0, 14.0), (24, 8)),
-    ],
-)
-def test_a_finer_image_is_shrunk_along_each_axis_to_the_pixels_per_radian_of_the_left_one(focal, size):
-    right = np.diag([*focal, 1.0])
-    right[:2, 2] = 13.0, 11.0
-    image, found = g.as_fine_as(torch.rand(3, 24, 32), tensor(right)[0], tensor(K)[0])
-    assert tuple(image.shape[1:]) == size
-    expected = g.resize_intrinsics(tensor(right), (24, 32), size)[0]
-    np.testing.assert_allclose(found, expected)
-    assert found[0, 0] <= 31.0 + 1e-9 and found[1, 1] <= 28.0 + 1e-9
-
-
-def test_a_pair_is_rectified_within_its_tolerances():
-    """A table of single changes, on either side of each tolerance and in both signs, as one batch."""
-    cases = [(("T", 0, 3), 0.3, True), (("T", 0, 3), -1e-3, True)]
-    for sign in (1, -1):
-        cases += [(("T", i, j), sign * 0.9e-3, True) for i in range(3) for j in range(3) if i != j]
-        cases += [(("T", i, j), sign * 1.1e-3, False) for i in range(3) for j in range(3) if i != j]
-        cases += [
-            (("T", i, 3), sign * size, ok) for i in (1, 2) for size, ok in ((0.0009, True), (0.0011, False))
-        ]
-        for i, j in ((0, 0), (0, 1), (1, 1), (1, 2)):
-            cases += [(("K", i, j), sign * 0.026, True), (("K", i, j), sign * 0.030, False)]
-        cases += [(("K", 0, 2), sign * 5.0, True)]
-    K_left, K_r, T = (np.tile(matrix, (len(cases), 1, 1)) for matrix in (K, K, T_of((0.1, 0, 0))))
-    for n, ((which, i, j), change, _) in enumerate(cases):
-        target = T if which == "T" else K_r
-        target[n, i, j] = change if (i, j) == (0, 3) else target[n, i, j] + change
-    for n in (0, 1):
-        T[n, 1:3, 3] = 0.5 * 0.01 * abs(T[n, 0, 3])
-    found = g.is_rectified(*map(batch, (K_left, K_r, T)))
-    assert found.shape == (len(cases),) and found.tolist() == [ok for *_, ok in cases]
-    assert bool(g.is_rectified(tensor(K)[0], tensor(K)[0], tensor(T_of((-0.1, 0, 0)))[0]))
-    assert not g.is_rectified(tensor(K), tensor(K), tensor(np.eye(4))).any()  # without a baseline
 
 
 def test_values_are_sampled_between_pixel_centres_and_the_edge_is_repeated():
@@ -315,15 +235,14 @@ def test_a_screen_hides_what_rays_of_the_right_camera_do_not_reach():
         hidden_by_a_screen(K_left[1], K_r[1], T[1], ((-0.4, 0.6), (-0.5, 0.4)), 2.5, 6.0),
     ]
     depth = batch([each for each, _ in made])[:, None]
-    cameras = [batch(each) for each in (K_left, K_r, T)]
-    for rays in (None, g.rays_of(depth, *cameras)):
-        found = g.hidden_in_right(depth, *cameras, (50, 110), rays)
-        assert found.shape == (2, 1, 60, 80) and found.dtype == torch.bool
-        for b, (_, marks) in enumerate(made):
-            clear, hidden = marks < 2, found[b, 0].numpy()
-            assert (marks == 1).sum() > 60
-            assert (hidden[clear] == (marks[clear] == 1)).mean() > 0.995
-            assert hidden[marks == 1].mean() > 0.97
+    rays = rays_of(depth, K_left, K_r, T)
+    found = g.occluded_in_right(depth, rays, (50, 110))
+    assert found.shape == (2, 1, 60, 80) and found.dtype == torch.bool
+    for b, (_, marks) in enumerate(made):
+        clear, hidden = marks < 2, found[b, 0].numpy()
+        assert (marks == 1).sum() > 60
+        assert (hidden[clear] == (marks[clear] == 1)).mean() > 0.995
+        assert hidden[marks == 1].mean() > 0.97
     # The same in a mirror, for either axis.
     for axis, (side, side_right) in enumerate(((80, 110), (60, 50))):
         mirror = np.eye(4)
@@ -332,7 +251,7 @@ def test_a_screen_hides_what_rays_of_the_right_camera_do_not_reach():
         for each, last in zip(mirrored, (side - 1, side_right - 1), strict=True):
             each[:, axis, 2] += last
         flipped = depth.flip(3 - axis)
-        again = g.hidden_in_right(flipped, *map(batch, (*mirrored, mirror @ T @ mirror)), (50, 110))
+        again = g.occluded_in_right(flipped, rays_of(flipped, *mirrored, mirror @ T @ mirror), (50, 110))
         assert (again.flip(3 - axis) != found).sum() == 0
 
 
@@ -341,9 +260,9 @@ def test_a_strip_that_is_hidden_is_not_a_pixel_wider_than_by_rays(axis):
     """Disparities of 12.1 and 6.05 px: the square begins at 12.4, where pixel 18 of the wall is at 11.95."""
     depth = torch.full((1, 1, 60, 60), 4.0)
     depth[..., 25:40, 25:40] = 2.0
-    wide = tensor(camera(40.0, 29.5, 29.5)).float()
+    wide = camera(40.0, 29.5, 29.5)
     at = np.roll([0.605, 0.0, 0.0], axis)
-    hidden = g.hidden_in_right(depth, wide, wide, tensor(T_of(at)).float(), (60, 60))[0, 0]
+    hidden = g.occluded_in_right(depth, rays_of(depth, wide, wide, T_of(at)), (60, 60))[0, 0]
     row = hidden[30] if axis == 0 else hidden[:, 30]
     assert row.nonzero()[:, 0].tolist() == list(range(19, 25))
 
@@ -352,8 +271,8 @@ def test_a_strip_that_is_hidden_is_not_a_pixel_wider_than_by_rays(axis):
 def test_only_a_depth_nearer_by_more_than_a_margin_hides(ratio, hides):
     depth = torch.full((1, 1, 20, 40), 2.0)
     depth[..., 20:] = 2.0 / ratio
-    wide, aside = (tensor(camera(400.0, cx, 9.5)).float() for cx in (19.5, 61.5))
-    found = g.hidden_in_right(depth, wide, aside, tensor(T_of((0.2, 0, 0))).float(), (20, 40))
+    wide, aside = (camera(400.0, cx, 9.5) for cx in (19.5, 61.5))
+    found = g.occluded_in_right(depth, rays_of(depth, wide, aside, T_of((0.2, 0, 0))), (20, 40))
     assert bool(found.any()) == hides
 
 
@@ -369,3 +288,105 @@ def test_helpers_keep_types_and_copy_only_what_they_must():
     reversed_rows = np.arange(6.0)[::-1]
     assert torch.equal(g.to_device_of(one, reversed_rows), torch.arange(5.0, -1, -1, dtype=torch.float64))
     assert g.to_device_of(one, one) is one
+
+
+F, B, Z = 40.0, 0.12, 2.0
+CAMERA = Camera(np.array([[F, 0, 15.5], [0, F, 11.5], [0, 0, 1]]), SIZE[::-1])
+
+
+def rig(x=0.0, y=0.0, z=0.0):
+    E = np.eye(4)
+    E[:3, 3] = x, y, z
+    return np.linalg.inv(E)
+
+
+def rays_of_of_conventions(depth_m, T, right=CAMERA):
+    return g.plane_rays(depth_m, [CAMERA], [right], [T])
+
+
+def uv_of_of_conventions(T, depth=Z, right=CAMERA):
+    depth_m = torch.full((1, 1, *SIZE), depth)
+    return g.project_rays(depth_m, rays_of_of_conventions(depth_m, T, right))
+
+
+def test_convention_camera_frame_is_x_right_y_down_z_forward():
+    points = Z * CAMERA.rays(np.stack(np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0])), -1))
+    assert points[0, -1, 0] > 0 > points[0, 0, 0]
+    assert points[-1, 0, 1] > 0 > points[0, 0, 1]
+    assert (points[..., 2] == Z).all() and np.linalg.norm(points[0, 0]) > Z  # z is not the length of the ray
+
+
+def test_convention_integer_pixel_is_the_centre_of_a_pixel():
+    image = torch.arange(12.0).view(1, 1, 3, 4)
+    assert g.sample_at(image, torch.tensor([[[[0.0, 0.0]]]])).item() == 0.0
+    assert g.sample_at(image, torch.tensor([[[[3.0, 2.0]]]])).item() == 11.0
+    assert g.sample_at(image, torch.tensor([[[[0.5, 0.0]]]])).item() == pytest.approx(0.5)
+
+
+def test_convention_intrinsics_follow_a_resize_with_the_half_pixel_shift():
+    K_640 = np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
+    K_320 = Camera(K_640, (640, 480)).resized((320, 240)).K
+    assert K_320.tolist() == [[250.0, 0.0, 159.5], [0.0, 250.0, 119.5], [0, 0, 1]]
+
+
+def test_convention_E_is_camera_to_world_and_T_maps_left_points_to_the_right_frame():
+    assert rig(x=B)[0, 3] == pytest.approx(-B)
+    assert rig(x=B) @ [B, 0.0, 0.0, 1.0] == pytest.approx([0.0, 0.0, 0.0, 1.0])
+
+
+def test_convention_right_camera_at_plus_x_sees_content_shifted_left_by_f_b_over_z():
+    uv, _ = uv_of_of_conventions(rig(x=B))
+    u = torch.arange(SIZE[1], dtype=torch.float32).expand(SIZE)
+    torch.testing.assert_close(uv[0, ..., 0], u - F * B / Z)
+    # the same, seen in images: the left image's content lies f * b / z = 2.4 px further left in the right one
+    columns = torch.arange(SIZE[1], dtype=torch.float32).view(1, 1, 1, -1).expand(1, 1, *SIZE)
+    depth_m = torch.full((1, 1, *SIZE), Z)
+    warped = g.warp_right_to_left(columns, depth_m, rays_of_of_conventions(depth_m, rig(x=B)))
+    assert warped.image[0, 0, 5, 20].item() == pytest.approx(20 - 2.4, abs=1e-4)
+    assert not warped.visible[..., :2].any() and warped.visible[..., 3:].all()
+
+
+def test_convention_right_camera_ahead_sees_nearer_points():
+    _, z = uv_of_of_conventions(rig(z=0.5))
+    assert (z == Z - 0.5).all()
+    below, _ = uv_of_of_conventions(rig(y=B))  # and a right camera below sees content shifted up
+    assert below[0, 10, 5, 1].item() == pytest.approx(10 - F * B / Z, abs=1e-4)
+
+
+def test_convention_doffs_is_the_difference_of_principal_points():
+    doffs = 3.0
+    uv, _ = uv_of_of_conventions(rig(x=B), right=CAMERA.cropped((-3, 0, 32, 24)))
+    disparity = 20 - uv[0, 5, 20, 0].item()
+    assert F * B / (disparity + doffs) == pytest.approx(Z, rel=1e-5)
+
+
+def test_convention_tuple_is_left_and_right_and_poses_are_camera_to_world():
+    K_left, K_right, E_left, E_right = CAMERA.K, CAMERA.K.copy(), np.eye(4), np.eye(4)
+    K_right[0, 2] += 3.0
+    E_left[:3, 3], E_right[:3, 3] = (1.0, -2.0, 0.5), (1.0 + B, -2.0, 0.5)
+    right = np.zeros((*(2 * side for side in SIZE), 3), np.float32)
+    (rig,) = GeometryGuidance(right, (K_left, K_right), (E_left, E_right), cropped=True).rigs
+    assert rig.K_right[0, 2] - rig.K_left[0, 2] == pytest.approx(3.0)
+    assert (rig.E[0, 3], rig.T_right_from_left[0, 3]) == pytest.approx((B, -B), abs=1e-6)
+
+
+def test_convention_masks_are_boolean_and_nothing_is_nan():
+    depth_m = torch.full((1, 1, *SIZE), Z)
+    depth_m[..., :4] = 0.01  # leaves the right image
+    rays = rays_of_of_conventions(depth_m, rig(x=B, z=0.5))
+    warped = g.warp_right_to_left(torch.rand(1, 3, *SIZE), depth_m, rays)
+    uv, z_right = g.project_rays(depth_m, rays)
+    assert warped.visible.dtype == torch.bool and 0 < warped.visible.float().mean() < 1
+    assert all(torch.isfinite(values).all() for values in (warped.image, uv, z_right))
+
+
+def test_convention_one_entry_an_image_and_networks_in_bfloat16_with_metres_in_float32(
+    make_pipeline, textured_plane
+):
+    plane, pipe = textured_plane, enable_geometry_guidance(make_pipeline().to(torch.bfloat16))
+    guidance = GeometryGuidance([plane.right] * 2, [plane.K] * 2, [plane.E] * 2, guidance_steps=1)
+    out = pipe([plane.left] * 2, guidance=guidance, num_inference_steps=1, output_type="pt")
+    assert pipe.unet.dtype == torch.bfloat16 and out.prediction.shape[0] == 2
+    made = [out.prediction, out.scale, out.shift, out.global_scale]
+    made += [values for report in out.history for values in (report.loss, report.s_hat, report.g_s)]
+    assert {values.dtype for values in made} == {torch.float32}

@@ -1,121 +1,40 @@
 """Options are declared once: their flags, their checks, and what is common to all that runs a prior."""
 
 import json
-from dataclasses import MISSING, dataclass, field, fields
-from pathlib import Path
+from dataclasses import MISSING, dataclass, fields
 from types import UnionType
 from typing import get_args, get_origin, get_type_hints
 
 import pytest
 
 from geodiff_plugin import options as module
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.cli.app import COMMANDS as CLI_COMMANDS
 from geodiff_plugin.config import PRESETS
 from geodiff_plugin.evaluation.options import COMMANDS as EVAL_COMMANDS
 from geodiff_plugin.options import (
-    PANELS,
+    MACHINE_RULES,
+    SECTIONS,
+    Excludes,
+    Given,
+    MachineOptions,
+    Needs,
     PriorOptions,
     RunOptions,
     SpeedOptions,
-    check_engine,
-    check_options,
-    declare,
-    engine_option,
-    flag_of,
-    gpus_option,
-    help_of,
-    on_ray,
-    rules_of,
-    workers_option,
+    check_rules,
 )
 from geodiff_plugin.scale.space import SPACES
-
-
-@dataclass(frozen=True)
-class Some:
-    """Options with every kind of rule; ``plain`` is none."""
-
-    plain: int = 3
-    source: Path = declare(None, "A source.", "")
-    first_side: float = declare(1.0, "A number.", low=0.5, high=2.0)
-    whole: int | None = declare(None, "A whole number.", low=1, high=9)
-    length: float | None = declare(None, "A length.", above_0="metres")
-    kinds: tuple[str, ...] = declare((), "Kinds.", "--kind", "-k", choices=("a", "b"))
-    sizes: tuple[int, ...] = declare((), "Sizes.", low=2, high=4)
-    other: int = field(default=4, metadata={"unit": "m"})
-
-
-OF_SOME = {each.name: each for each in fields(Some)}
-
-
-def test_a_flag_is_that_of_the_rules_or_the_name_with_dashes():
-    flags = {name: flag_of(each) for name, each in OF_SOME.items()}
-    assert flags["first_side"] == "--first-side" and flags["plain"] == "--plain"
-    assert flags["source"] == "SOURCE" and flags["kinds"] == "--kind"
-    assert rules_of(OF_SOME["plain"]) is rules_of(OF_SOME["other"]) is None
-    assert rules_of(OF_SOME["source"]).is_argument and not rules_of(OF_SOME["kinds"]).is_argument
-
-
-def test_a_declaration_keeps_what_it_is_given():
-    made = declare(
-        5,
-        "Help.",
-        "--flag",
-        "-f",
-        panel="Panel",
-        low=1.0,
-        high=9.0,
-        above_0="metres",
-        choices=("x",),
-        split=True,
-        metavar="WORD",
-    )
-    rules = made.metadata["rules"]
-    assert made.default == 5 and (rules.help, rules.flags, rules.panel) == (
-        "Help.",
-        ("--flag", "-f"),
-        "Panel",
-    )
-    assert (rules.low, rules.high, rules.above_0) == (1.0, 9.0, "metres")
-    assert (rules.choices, rules.split, rules.metavar) == (("x",), True, "WORD")
-    bare = declare(MISSING, "Help.")
-    rules = bare.metadata["rules"]
-    assert bare.default is MISSING and rules.flags == rules.choices == () and rules.panel == "Options"
-    assert rules.low is rules.high is rules.metavar is None and rules.above_0 == "" and not rules.split
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"first_side": 0.49}, "--first-side must be between 0.5 and 2"),
-        ({"first_side": 2.01}, "--first-side must be between 0.5 and 2"),
-        ({"first_side": "1"}, "--first-side must be a number"),
-        ({"whole": 0}, "--whole must be between 1 and 9"),
-        ({"whole": 2.0}, "--whole must be an integer"),
-        ({"length": 0.0}, "--length must be a finite number of metres above 0"),
-        ({"kinds": ("a", "c")}, "--kind must be one of a, b"),
-        ({"sizes": (3, 5)}, "--sizes must be between 2 and 4"),
-    ],
-)
-def test_values_are_held_against_what_is_declared(given, said):
-    with pytest.raises(InputError, match=said):
-        check_options(Some(**given))
-    with pytest.raises(InputError, match="^<"):
-        check_options(Some(**given), lambda each: f"<{each.name}>")
-
-
-def test_values_within_the_rules_pass():
-    check_options(Some())
-    check_options(Some("anything", None, 2, 9, 1e-9, ("b", "a"), (2, 4), None))
+from geodiff_plugin.settings import check_settings, setting, settings_of
 
 
 def test_what_all_commands_that_run_a_prior_have_in_common():
     assert set(module.SPACES) == set(SPACES) and set(module.PRESETS) <= set(PRESETS)
-    for kind in (PriorOptions, SpeedOptions, RunOptions):
-        assert all(rules_of(each) and rules_of(each).panel in PANELS for each in fields(kind))
-    assert help_of("device").startswith("Where it runs") and help_of("seed") == "Seed of the noise."
-    assert len(set(PANELS)) == len(PANELS)
+    for record in (PriorOptions, SpeedOptions, RunOptions, MachineOptions):
+        assert list(settings_of(record)) == [field.name for field in fields(record)]
+        assert {option.section for option in settings_of(record).values()} <= set(SECTIONS)
+    assert settings_of(RunOptions)["seed"].help == "Random seed of the noise."
+    assert len(set(SECTIONS)) == len(SECTIONS)
 
 
 def run(**given) -> RunOptions:
@@ -146,13 +65,13 @@ def test_a_range_of_depths_goes_to_the_search_that_the_preset_has():
     assert run(**depths, preset="fast").config() == PRESETS["fast"].changed(depth_range=(1.5, 9.0))
     paper = run(**depths, preset="paper").config()
     assert paper == PRESETS["paper"].changed(g_s_range=(1.5, 9.0))
-    typed = run(**depths, preset="paper", knob=("g_s_range=[2,3]", "planes=99")).config()
+    typed = run(**depths, preset="paper", parameter=("g_s_range=[2,3]", "planes=99")).config()
     assert typed.g_s_range == (2.0, 3.0) and typed.planes == 99 and typed.depth_range is None
     assert run(preset="paper").config() == PRESETS["paper"]
-    with pytest.raises(InputError, match="Give depth_range as --near and --far"):
-        run(knob=("depth_range=[1,2]",)).config()
-    with pytest.raises(InputError, match="--knob must be"):
-        run(knob=("planes",)).config()
+    with pytest.raises(InputError, match="depth_range cannot be set with --set. Use --near and --far"):
+        run(parameter=("depth_range=[1,2]",)).config()
+    with pytest.raises(InputError, match="--set must be"):
+        run(parameter=("planes",)).config()
 
 
 @pytest.mark.parametrize(
@@ -161,7 +80,7 @@ def test_a_range_of_depths_goes_to_the_search_that_the_preset_has():
         ({"near": 2.0}, "<near> needs <far>"),
         ({"far": 2.0}, "<far> needs <near>"),
         ({"near": 3.0, "far": 2.5}, "<near> must be less than <far>; got 3 and 2.5"),
-        ({"resolution": 60}, "<resolution> must be a multiple of 8 from 32 on, or 0; got 60. Try 64"),
+        ({"resolution": 60}, "<resolution> must be 0 or a multiple of 8, at least 32; got 60. Try 64"),
         ({"resolution": 8}, "<resolution> must be .*Try 32"),
         ({"device": "gpu"}, "<device> must be"),
         ({"option": ("x",)}, "<option> must be NAME=VALUE"),
@@ -170,9 +89,9 @@ def test_a_range_of_depths_goes_to_the_search_that_the_preset_has():
         ({"space": "metres"}, "<space> must be one of"),
     ],
 )
-def test_what_contradicts_itself_is_said_with_the_names_of_the_caller(given, said):
+def test_contradictions_are_reported_with_the_names_of_the_caller(given, said):
     with pytest.raises(InputError, match=said):
-        run(**given).check(lambda each: f"<{each.name}>")
+        run(**given).check(lambda option: f"<{option.name}>")
 
 
 def test_what_fits_passes():
@@ -185,65 +104,75 @@ def test_what_fits_passes():
 
 
 def test_options_are_json():
-    plain = run(knob=("a=1",), near=1.5, far=2.0).as_json()
+    plain = run(parameter=("a=1",), near=1.5, far=2.0).as_json()
     assert json.loads(json.dumps(plain)) == plain
     assert (
-        plain["knob"] == ["a=1"]
+        plain["parameter"] == ["a=1"]
         and plain["near"] == 1.5
         and set(plain) == {each.name for each in fields(RunOptions)}
     )
 
 
-@dataclass(frozen=True)
-class OnMachines:
-    engine: str = engine_option()
-    workers: int | None = workers_option()
-    gpus: float | None = gpus_option()
-    shard: str | None = None
+@dataclass(frozen=True, kw_only=True)
+class OnMachines(MachineOptions):
+    shard: str | None = setting(None, "A part.")
 
 
 def test_options_of_ray_need_it_and_shards_exclude_it():
-    check_engine(OnMachines("ray", 2, 0.0))
-    check_engine(OnMachines("local", shard="0/2"))
+    check_rules(OnMachines(engine="ray", workers=2, gpus=0.0), MACHINE_RULES)
+    check_rules(OnMachines(shard="0/2"), MACHINE_RULES)
+    check_rules(MachineOptions(engine="ray"), MACHINE_RULES)  # shards are no option of it
     for made, said in (
-        (OnMachines("local", 2), "--workers needs --engine ray"),
-        (OnMachines("local", None, 0.0), "--gpus needs --engine ray"),
-        (OnMachines("ray", shard="0/2"), "--shard cannot be used with --engine ray"),
+        (OnMachines(workers=2), "--workers needs --engine ray.$"),
+        (OnMachines(gpus=0.0), "--gpus needs --engine ray.$"),
+        (OnMachines(engine="ray", shard="0/2"), "--shard cannot be used with --engine ray: Ray distributes"),
     ):
         with pytest.raises(InputError, match=said):
-            check_engine(made)
-    for made, passes in (
-        (OnMachines("ray", 10**6, 64), True),
-        (OnMachines("ray", 1, 0), True),
-        (OnMachines("ray", 0), False),
-        (OnMachines("ray", 10**6 + 1), False),
-        (OnMachines("ray", 1, 64.5), False),
-        (OnMachines("spark"), False),
+            check_rules(made, MACHINE_RULES)
+
+
+@pytest.mark.parametrize(
+    ("given", "passes"),
+    [
+        ({"engine": "ray", "workers": 10**6, "gpus": 64}, True),
+        ({"engine": "ray", "workers": 1, "gpus": 0}, True),
+        ({"engine": "ray", "workers": 0}, False),
+        ({"engine": "ray", "workers": 10**6 + 1}, False),
+        ({"engine": "ray", "workers": 1, "gpus": 64.5}, False),
+        ({"engine": "spark"}, False),
+    ],
+)
+def test_workers_and_gpus_have_ranges(given, passes):
+    if passes:
+        check_settings(MachineOptions(**given))
+    else:
+        with pytest.raises(InputError):
+            check_settings(MachineOptions(**given))
+
+
+@dataclass(frozen=True)
+class Meal:
+    """Options that need and exclude each other."""
+
+    dish: str = setting("", "What.", "")
+    sauce: str | None = setting(None, "Sauce.")
+    spoons: int = setting(0, "Spoons.", "--spoon", "-s")
+    raw: bool = setting(False, "Raw.")
+
+
+def test_a_rule_names_the_option_and_what_it_needs_or_excludes():
+    needs = Needs(("spoons", "sauce"), (Given("dish", "soup"), Given("raw")), "it is for soup")
+    excludes = Excludes(("sauce",), Given("spoons"))
+    for meal in (Meal(), Meal("soup", "soy"), Meal(raw=True, spoons=2), Meal(sauce=None)):
+        check_rules(meal, [needs, excludes])
+    for meal, said in (
+        (Meal("fish", spoons=1), "--spoon needs DISH soup or --raw: it is for soup."),
+        (Meal(sauce="soy"), "--sauce needs DISH soup or --raw: it is for soup."),
+        (Meal("soup", "soy", 1), "--sauce cannot be used with --spoon."),
     ):
-        if passes:
-            check_options(made)
-        else:
-            with pytest.raises(InputError):
-                check_options(made)
-    assert OnMachines().engine == "local"
-
-
-def test_without_ray_its_extra_is_named_and_other_errors_stay(monkeypatch):
-    def missing(name):
-        def imported(where):
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-        return imported
-
-    for name in ("ray", "pyarrow"):
-        monkeypatch.setattr(module, "imported", missing(name))
-        with pytest.raises(InputError, match=r"geodiff-plugin\[ray\]"):
-            on_ray("pairs_to_folders")
-    monkeypatch.setattr(module, "imported", missing("numpy"))
-    with pytest.raises(ModuleNotFoundError):
-        on_ray("pairs_to_folders")
-    monkeypatch.setattr(module, "imported", lambda where: where)
-    assert on_ray("pairs_to_folders") == "jobs.cluster.pairs_to_folders"
+        with pytest.raises(InputError) as refused:
+            check_rules(meal, [needs, excludes])
+        assert str(refused.value) == said
 
 
 def dataclasses_of_options() -> list[type]:
@@ -254,14 +183,11 @@ def dataclasses_of_options() -> list[type]:
 @pytest.mark.parametrize("kind", dataclasses_of_options(), ids=lambda kind: kind.__name__)
 def test_the_default_of_every_option_has_its_type_and_its_help_is_a_sentence(kind):
     hints = get_type_hints(kind)
-    for each in fields(kind):
-        if rules_of(each) is None:
-            continue
-        about = rules_of(each).help
-        assert about.endswith((".", ")", "].")) and " " in about, each.name
-        if each.default is not MISSING:
-            allowed = get_args(hints[each.name]) if get_origin(hints[each.name]) is UnionType else ()
-            allowed = [get_origin(one) or one for one in allowed or (hints[each.name],)]
-            assert isinstance(each.default, tuple(allowed)), f"{each.name}: {each.default!r}"
-            if rules_of(each).choices and isinstance(each.default, str):
-                assert each.default in rules_of(each).choices, each.name
+    for name, option in settings_of(kind).items():
+        assert option.help.endswith((".", ")", "].")) and " " in option.help, name
+        if option.default is not MISSING:
+            allowed = get_args(hints[name]) if get_origin(hints[name]) is UnionType else ()
+            allowed = [get_origin(one) or one for one in allowed or (hints[name],)]
+            assert isinstance(option.default, tuple(allowed)), f"{name}: {option.default!r}"
+            if option.choices and isinstance(option.default, str):
+                assert option.default in option.choices, name

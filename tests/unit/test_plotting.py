@@ -1,4 +1,4 @@
-"""Pictures: colours, legend, contact sheet, and every figure of the evaluation on one tiny pair."""
+"""Images: colours, legend, contact sheet, and every figure of the evaluation on one tiny pair."""
 
 import json
 
@@ -7,11 +7,12 @@ import matplotlib
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from PIL import Image
-from typer.testing import CliRunner
 
-from geodiff_plugin import _strips, plotting
-from geodiff_plugin._checks import InputError
+from geodiff_plugin import plotting
+from geodiff_plugin._internal import strips as _strips
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.figures import sweep_g_s
@@ -19,13 +20,13 @@ from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.plotting import (
     check_video,
     colour_depth,
-    colour_share,
+    colour_fraction,
     depth_figure,
     depth_frames,
     depth_range,
+    fraction_figure,
     grid,
     overview,
-    share_figure,
     shrunk,
     ticks,
     write_depth_video,
@@ -35,11 +36,11 @@ from tests.evaluating import write_scenes
 
 def test_near_is_yellow_far_is_blue_unknown_is_grey():
     depth = np.array([[1.0, 2.0, 4.0, np.inf], [np.nan, 0.0, -1.0, -np.inf]])
-    picture = colour_depth(depth, near=1, far=4)
-    assert picture.dtype == np.uint8 and picture.shape == (2, 4, 3)
+    rgb = colour_depth(depth, near=1, far=4)
+    assert rgb.dtype == np.uint8 and rgb.shape == (2, 4, 3)
     expected = matplotlib.colormaps["plasma"]([1.0, 0.5, 0.0])[:, :3] * 255
-    np.testing.assert_allclose(picture[0, :3], expected, atol=1)
-    assert (np.concatenate([picture[0, 3:], picture[1]]) == 128).all()
+    np.testing.assert_allclose(rgb[0, :3], expected, atol=1)
+    assert (np.concatenate([rgb[0, 3:], rgb[1]]) == 128).all()
     lightness = colour_depth(np.geomspace(1, 9, 100)[None], near=1, far=9)[0] @ (0.2126, 0.7152, 0.0722)
     assert (np.diff(lightness) <= 1).all() and lightness[0] - lightness[-1] > 180
 
@@ -68,7 +69,7 @@ def test_flat_and_empty_maps_and_ends_beyond_the_data_have_a_range(depth, ends):
         (lambda: grid([np.zeros((2, 2, 4))], ["a"]), "images"),
     ],
 )
-def test_what_is_no_picture_or_range_is_named(call, match):
+def test_values_that_are_no_image_or_range_are_named(call, match):
     with pytest.raises(ValueError, match=match):
         call()
 
@@ -83,7 +84,7 @@ def test_ticks_are_few_rising_inside_and_round(near, ratio):
     assert len({f"{value:g}" for value in values}) == len(values)
 
 
-def test_a_figure_is_the_map_beside_its_legend():
+def test_a_figure_is_the_map_next_to_its_legend():
     depth = np.tile(np.geomspace(1, 20, 300), (260, 1))
     pixels = np.asarray(depth_figure(depth))
     np.testing.assert_array_equal(pixels[:, :300], colour_depth(depth))
@@ -105,8 +106,8 @@ def test_a_figure_is_the_map_beside_its_legend():
 def test_grid_places_cells_and_titles():
     red = np.zeros((20, 40, 3), dtype=np.uint8)
     red[..., 0] = 255
-    pictures = [red, np.zeros((40, 40)), np.ones((20, 40), bool), Image.new("L", (10, 5), 77), red / 255.0]
-    sheet = grid(pictures, ["a", "b", "c", "d", "too long for its cell" * 3], columns=2, cell_width=80)
+    rgb_images = [red, np.zeros((40, 40)), np.ones((20, 40), bool), Image.new("L", (10, 5), 77), red / 255.0]
+    sheet = grid(rgb_images, ["a", "b", "c", "d", "too long for its cell" * 3], columns=2, cell_width=80)
     pixels = np.asarray(sheet)
     assert sheet.size == (6 + 2 * 86, 6 + (80 + 40 + 40) + 3 * (24 + 6))
     assert tuple(pixels[35, 46]) == (255, 0, 0) and (pixels == 77).all(axis=-1).any()
@@ -139,13 +140,13 @@ def test_every_shade_of_a_map_is_the_place_of_its_logarithm_between_the_ends(str
     for top in (1.0, 4.0):
         values = np.linspace(-0.2 * top, 1.2 * top, 60).reshape(4, 15)
         values[2, 3] = np.nan
-        colours = colour_share(values, top)
+        colours = colour_fraction(values, top)
         known = np.isfinite(values)
         assert (colours[~known] == 128).all()
         np.testing.assert_allclose(
             place_in("YlGnBu_r", colours[known]), np.clip(values[known] / top, 0, 1), atol=0.02
         )
-    np.testing.assert_array_equal(colour_share(values / 4), colour_share(values, 4.0))
+    np.testing.assert_array_equal(colour_fraction(values / 4), colour_fraction(values, 4.0))
 
 
 def test_the_ends_of_the_colours_leave_two_per_cent_on_either_side():
@@ -171,7 +172,7 @@ def test_the_ends_of_the_colours_leave_two_per_cent_on_either_side():
 
 
 def test_the_ends_of_a_large_map_are_those_of_a_sample_of_its_known_pixels(monkeypatch):
-    monkeypatch.setattr(plotting, "MOST_FOR_RANGE", 100)
+    monkeypatch.setattr(plotting, "MAX_RANGE_PIXELS", 100)
     depth = np.random.default_rng(0).uniform(1, 9, (30, 30))
     depth[1::3], depth[:, 1::3], depth[2::3], depth[:, 2::3] = 50, 50, 50, 50
     near, far = depth_range(depth)  # every third row and column
@@ -191,7 +192,7 @@ def test_a_range_of_ticks_uses_1_2_and_5_or_more_of_them():
 
 
 @pytest.mark.parametrize("height", [260, 700])
-def test_marks_of_a_legend_are_at_their_places_beside_the_bar(height):
+def test_marks_of_a_legend_are_at_their_places_next_to_the_bar(height):
     """The black tick of each depth is where the bar has the colour of that depth in the map."""
     depth = np.tile(np.geomspace(1, 16, 300), (height, 1))
     figure = np.asarray(depth_figure(depth, near=1, far=16))
@@ -233,36 +234,61 @@ def test_a_map_with_unknown_pixels_has_a_key_to_the_grey():
     ).all()
 
 
-def test_the_label_says_the_unit():
+def test_the_label_states_the_unit():
     depth = np.tile(np.geomspace(1, 16, 60), (260, 1))
     metres, feet, none = (np.asarray(depth_figure(depth, unit=unit))[:22, 60:] for unit in ("m", "ft", None))
     assert not np.array_equal(metres, feet) and not np.array_equal(metres, none)
     np.testing.assert_array_equal(metres, np.asarray(depth_figure(depth))[:22, 60:])
 
 
-def test_a_figure_of_shares_has_its_colours_and_five_marks():
+def test_a_figure_of_fractions_has_its_colours_and_round_marks():
     values = np.tile(np.linspace(0, 0.5, 300), (300, 1))
-    pixels = np.asarray(share_figure(values, "difference", 0.5))
-    np.testing.assert_array_equal(pixels[:, :300], colour_share(values, 0.5))
+    pixels = np.asarray(fraction_figure(values, "difference", 0.5))
+    np.testing.assert_array_equal(pixels[:, :300], colour_fraction(values, 0.5))
     letters = 12
     right = letters // 2 + max(14, 300 // 24)
     marks = (pixels[:, 300 + right + 1] < 100).all(axis=-1)
     dark = np.flatnonzero(marks & (np.arange(300) > 20))  # below the label
-    expected = [288 - share * (288 - 24) for share in (1, 0.75, 0.5, 0.25, 0)]
+    expected = [288 - fraction * (288 - 24) for fraction in (1, 0.8, 0.6, 0.4, 0.2, 0)]
     np.testing.assert_allclose(dark, expected, atol=1)
     bar = pixels[30:280, 300 + letters // 2 + 6]
     np.testing.assert_allclose(place_in("YlGnBu_r", bar), (288 - np.arange(30, 280) - 0.5) / 264, atol=0.02)
     values[0, 0] = np.inf
-    assert (np.asarray(share_figure(values, "difference", 0.5))[:, 300:] == 128).all(axis=-1).sum() > 50
+    assert (np.asarray(fraction_figure(values, "difference", 0.5))[:, 300:] == 128).all(axis=-1).sum() > 50
+
+
+def test_ticks_of_an_error_are_round():
+    """0.0763 is the 98 % quantile of a real pair: its quarter would be labelled 0.019."""
+    labels = []
+    values = np.linspace(0, 0.0763, 300)[None].repeat(300, axis=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plotting, "_figure", lambda rgb, colours, label, marks, unknown: labels.extend(marks))
+        fraction_figure(values, "difference", 0.0763)
+    assert [text for _, text in labels] == ["0", "0.02", "0.04", "0.06"]
+    np.testing.assert_allclose([place for place, _ in labels], np.array([0, 0.02, 0.04, 0.06]) / 0.0763)
+
+
+def test_titles_are_centred_above_images_and_rows_have_a_legend():
+    images = [np.full((60, 100), 90, np.uint8)] * 4
+    plain = np.asarray(grid(images, ["ab"] * 4, columns=2, cell_width=100))
+    narrow = np.asarray(grid(images, ["ab"] * 4, columns=2, cell_width=100, image_width=60))
+    for sheet, centre in ((plain, 6 + 50), (narrow, 6 + 30)):
+        letters = np.flatnonzero((sheet[6:30, : 6 + 100] < 128).any(axis=(0, 2)))
+        assert (letters.min() + letters.max()) / 2 == pytest.approx(centre, abs=1.5)
+    coloured = np.asarray(grid(images, ["ab"] * 4, columns=2, cell_width=100, depth_ranges=[(1, 2), (1, 10)]))
+    np.testing.assert_array_equal(coloured[:, : plain.shape[1]], plain)
+    legends = coloured[:, plain.shape[1] :]
+    assert legends.shape[1] > 40 and not white(legends[:90]).all() and not white(legends[90:]).all()
+    assert (legends[:90] != legends[90:180][: len(legends[:90])]).any(), "each row has its own range"
 
 
 def test_cells_of_a_grid_keep_their_shape_and_stand_in_rows():
     """Each cell is at its place under its title; a row is as high as its highest."""
     sizes = ((40, 30), (60, 20), (20, 40), (50, 50), (30, 60))
     shades = (40, 80, 120, 160, 200)
-    pictures = [np.full((h, w), shade, np.uint8) for (w, h), shade in zip(sizes, shades, strict=True)]
+    rgb_images = [np.full((h, w), shade, np.uint8) for (w, h), shade in zip(sizes, shades, strict=True)]
     for columns, shape in ((2, (2, 3)), (3, (3, 2)), (None, (4, 2))):
-        sheet = np.asarray(grid(pictures, list("abcde"), columns=columns, cell_width=80))
+        sheet = np.asarray(grid(rgb_images, list("abcde"), columns=columns, cell_width=80))
         across, _ = shape
         heights = [round(h * 80 / w) for w, h in sizes]
         top = 6
@@ -281,25 +307,27 @@ def test_cells_of_a_grid_keep_their_shape_and_stand_in_rows():
                 assert white(sheet[y + heights[number], x : x + 80]).all()
             top += 24 + 6 + max(heights[number] for number in row)
         assert sheet.shape[:2] == (top, 6 + across * 86)
-    assert grid(pictures[:1], ["a"]).size == (6 + 326, 6 + 24 + 6 + 240)
+    assert grid(rgb_images[:1], ["a"]).size == (6 + 326, 6 + 24 + 6 + 240)
     with pytest.raises(TypeError):
-        grid(pictures[:1], ["a"], 2)  # settings are given by name
+        grid(rgb_images[:1], ["a"], 2)  # settings are given by name
 
 
-def test_pictures_of_every_kind_are_rgb():
+def test_images_of_every_kind_are_rgb():
     floats = np.array([[0.0, 0.5, np.nan], [1.0, 2.0, -1.0]])
     levels = np.array([[0, 128, 0], [255, 255, 0]])
-    np.testing.assert_array_equal(np.asarray(plotting.as_picture(floats))[..., 1], levels)
-    np.testing.assert_array_equal(np.asarray(plotting.as_picture(floats > 0.4))[..., 0], 255 * (floats > 0.4))
+    np.testing.assert_array_equal(np.asarray(plotting.as_rgb_image(floats))[..., 1], levels)
+    np.testing.assert_array_equal(
+        np.asarray(plotting.as_rgb_image(floats > 0.4))[..., 0], 255 * (floats > 0.4)
+    )
     colours = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
-    np.testing.assert_array_equal(np.asarray(plotting.as_picture(colours)), colours)
-    assert plotting.as_picture(Image.new("L", (3, 2), 7)).getpixel((1, 1)) == (7, 7, 7)
+    np.testing.assert_array_equal(np.asarray(plotting.as_rgb_image(colours)), colours)
+    assert plotting.as_rgb_image(Image.new("L", (3, 2), 7)).getpixel((1, 1)) == (7, 7, 7)
     for bad in (np.zeros((2, 3), int), np.zeros((2, 3, 4), np.uint8), np.zeros(3), np.zeros((1, 2, 3, 3))):
         with pytest.raises(ValueError, match="images must be PIL, or"):
-            plotting.as_picture(bad)
+            plotting.as_rgb_image(bad)
 
 
-def test_an_overview_has_the_left_image_beside_its_maps_in_one_scale(monkeypatch):
+def test_an_overview_has_the_left_image_next_to_its_maps_on_one_scale(monkeypatch):
     left = np.full((300, 400, 3), 0.25)
     depth = shrunk(Image.new("RGB", (600, 300), (0, 255, 0)))
     assert depth.size == (480, 240)
@@ -317,22 +345,22 @@ def test_an_overview_has_the_left_image_beside_its_maps_in_one_scale(monkeypatch
     assert titles == [
         "left image",
         "depth",
-        "confidence: within 10 % of the truth",
+        "confidence: within 10 % of ground truth",
         "photometric error (grey: not seen from the right)",
     ]
-    assert few_titles == titles[:2] and options == {"columns": 2, "cell_width": 480}
+    assert few_titles == titles[:2] and options == {"columns": 2, "cell_width": 480, "image_width": 320}
     beside = np.asarray(images[0])
     assert beside.shape == (240, 480, 3) and (beside[:, :320] == 64).all() and white(beside[:, 320:]).all()
     assert images[1] is depth and images[2] is sure and few[1] is depth
     drawn = np.asarray(images[3])[:, :400]
-    np.testing.assert_array_equal(drawn, colour_share(error, 0.2))
+    np.testing.assert_array_equal(drawn, colour_fraction(error, 0.2))
     for values, top in ((np.full((300, 400), 0.01), 0.05), (np.full((300, 400), np.nan), 0.05)):
         overview(left, depth, None, values)
-        np.testing.assert_array_equal(np.asarray(cells[-1][0][2])[:, :400], colour_share(values, top))
+        np.testing.assert_array_equal(np.asarray(cells[-1][0][2])[:, :400], colour_fraction(values, top))
     spread = np.linspace(0, 1, 300 * 400).reshape(300, 400)
     overview(left, depth, None, spread)
     np.testing.assert_array_equal(
-        np.asarray(cells[-1][0][2])[:, :400], colour_share(spread, np.quantile(spread, 0.98))
+        np.asarray(cells[-1][0][2])[:, :400], colour_fraction(spread, np.quantile(spread, 0.98))
     )
 
 
@@ -344,7 +372,7 @@ def test_large_maps_are_thinned_in_an_overview(monkeypatch):
     overview(left, Image.new("RGB", (100, 87)), None, left[..., 0])
     third = left[::3, ::3, 0]
     drawn = np.asarray(cells[0][2])[::3, : 3 * third.shape[1] : 3]  # enlarged by three for its legend
-    np.testing.assert_array_equal(drawn, colour_share(third, np.quantile(third, 0.98)))
+    np.testing.assert_array_equal(drawn, colour_fraction(third, np.quantile(third, 0.98)))
     thin = np.asarray(cells[0][0])
     assert thin.shape == (87, 100, 3) and (thin[:, 44:] == 255).all()
 
@@ -388,9 +416,9 @@ def test_a_video_has_its_frames_in_order_at_their_rate(suffix, tmp_path):
     np.testing.assert_allclose(found, shades, atol=12)
 
 
-def test_what_is_no_video_is_refused(tmp_path):
+def test_a_non_video_is_rejected(tmp_path):
     for name, fps, said in (
-        ("v.avi", 10, "the video must be a file that ends in .mp4, .webp, .gif; got v.avi"),
+        ("v.avi", 10, "the video must be a file with a suffix in .mp4, .webp, .gif; got v.avi"),
         ("v.MP4", 0.09, "fps must be between 0.1 and 120"),
         ("v.gif", 120.1, "fps must be between 0.1 and 120"),
     ):
@@ -398,7 +426,7 @@ def test_what_is_no_video_is_refused(tmp_path):
             check_video(tmp_path / name, fps)
     for fps in (0.1, 120):
         check_video("v.WEBP", fps)
-    with pytest.raises(ValueError, match="frames must be at least one picture; got none"):
+    with pytest.raises(ValueError, match="frames must be at least one image; got none"):
         write_depth_video(tmp_path / "v.gif", [])
     with pytest.raises(InputError, match=r"in an existing folder"):
         write_depth_video(tmp_path / "none" / "v.gif", [Image.new("RGB", (4, 4))])
@@ -420,7 +448,7 @@ def scenes(tmp_path):
 
 @pytest.fixture
 def draw(scenes, make_pipeline, tmp_path):
-    """``draw(name, *words)`` -> picture and numbers."""
+    """``draw(name, *words)`` -> image and numbers."""
     make_pipeline().save_pretrained(tmp_path / "prior")
 
     def run(name, *words):
@@ -431,11 +459,11 @@ def draw(scenes, make_pipeline, tmp_path):
         assert answer.exit_code == 0 and answer.stdout == f"{out / f'figure-{name}.png'}\n"
         with Image.open(out / f"figure-{name}.png") as image:
             assert image.mode == "RGB"
-            picture = np.asarray(image)
-        assert picture.shape[0] > 100 and picture.std() > 5
+            rgb = np.asarray(image)
+        assert rgb.shape[0] > 100 and rgb.std() > 5
         numbers = json.loads((out / f"figure-{name}.json").read_text())
         assert "eval figure" in numbers["command"] and f"--data {scenes}" in numbers["command"]
-        return picture, numbers
+        return rgb, numbers
 
     return run
 
@@ -444,11 +472,15 @@ def draw(scenes, make_pipeline, tmp_path):
     ("name", "words", "is_right"),
     [
         ("gs-sweep", ["--max", 20], lambda n: n["g_s_m"][::79] == [1, 20] and len(n["loss"]) == 80),
-        ("inner-steps", ["--updates", "2,1"], lambda n: n["updates"] == [1, 2] and n["paper"]["seconds"][1]),
+        (
+            "guidance-steps",
+            ["--updates", "2,1"],
+            lambda n: n["updates"] == [1, 2] and n["paper"]["seconds"][1],
+        ),
         ("ablation", ["--methods", "prior-aligned,sgbm"], lambda n: len(*n["abs_rel"].values()) == 2),
     ],
 )
-def test_a_figure_has_its_numbers_beside_it(draw, name, words, is_right):
+def test_a_figure_has_its_numbers_next_to_it(draw, name, words, is_right):
     assert is_right(draw(name, *words)[1])
 
 

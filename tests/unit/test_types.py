@@ -6,36 +6,23 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.messages import Message
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.result.output import MetricDepthOutput
-from geodiff_plugin.types import (
-    CameraView,
-    DepthFrame,
-    Indicators,
-    PosedViews,
-    Rig,
-    StepReport,
-    Verdict,
-)
+from geodiff_plugin.trust import KINDS, FactSheet, Verdict
+from geodiff_plugin.types import StepReport
 from tests.unit.jobs.made_runs import K_LEFT, pose
+from tests.views import made_rig, posed_frame
 
 E = pose((3.0, -7.0, 11.0), (0.12, -0.05, 0.2))
-REASON = Message("pose.inverse", "The inverse pose fits.")
+REASON = Finding(KINDS["depth.inverted-order"], "The inverse pose fits.")
 
 
 def test_a_rig_maps_points_of_the_left_camera_to_the_right_one():
-    rig = Rig(K_LEFT, K_LEFT, E)
+    rig = made_rig(K_LEFT, K_LEFT, E)
     point = np.array([0.3, -0.2, 2.0, 1.0])
     in_right = rig.T_right_from_left @ point
     np.testing.assert_allclose(E[:3, :3] @ in_right[:3] + E[:3, 3], point[:3])
     np.testing.assert_allclose(rig.T_right_from_left @ np.append(E[:3, 3], 1.0), [0, 0, 0, 1], atol=1e-15)
-
-
-def test_the_size_of_views_is_that_of_the_left_image_with_or_without_a_batch():
-    left = torch.zeros(3, 5, 7)
-    views = (CameraView(torch.zeros(3, 8, 9), torch.eye(3), torch.eye(4)),)
-    assert PosedViews(left, views, torch.eye(3)).size == (5, 7)
-    assert PosedViews(left[None], views, torch.eye(3)).size == (5, 7)
 
 
 def test_a_step_report_keeps_every_value_on_its_way_to_the_cpu():
@@ -50,18 +37,8 @@ def test_a_step_report_keeps_every_value_on_its_way_to_the_cpu():
     assert on_meta.cpu().terms["a"].device.type == "cpu"
 
 
-def verdict(status: str, *reasons: Message) -> Verdict:
-    return Verdict(status, reasons, (), Indicators())
-
-
-def test_a_verdict_says_what_forbids_trust_or_that_nothing_tests_it():
-    assert verdict("trusted").message is None and verdict("trusted").sentence == ""
-    assert verdict("trusted").trusted and not verdict("not judged").trusted
-    bad = verdict("not trusted", REASON, REASON)
-    assert bad.message.code == "verdict.not-trusted" and bad.sentence.endswith(f"{REASON} {REASON}")
-    unjudged = verdict("not judged", REASON).message
-    assert unjudged.code == "verdict.not-judged" and "neither matches of two views" in unjudged
-    assert not bad.trusted
+def verdict(status: str, *findings: Finding) -> Verdict:
+    return Verdict(status, findings, FactSheet())
 
 
 @pytest.mark.parametrize(
@@ -107,7 +84,7 @@ def test_depth_in_another_camera_is_made_of_each_image_with_its_own_k(kind):
     np.testing.assert_array_equal(
         np.asarray(output.valid).reshape(depths.shape), (depths > 0) & (confidence > 0)
     )
-    seen = output.into(K_into, into, (32, 26))
+    seen = output.reproject(K_into, into, (32, 26))
     assert tuple(seen.shape) == ((2, 26, 32, 1) if kind == "numpy" else (2, 1, 26, 32))
     seen = np.asarray(seen).reshape(2, 26, 32)
     v, u = np.mgrid[:26, :32]
@@ -121,7 +98,7 @@ def test_depth_in_another_camera_is_made_of_each_image_with_its_own_k(kind):
     without = MetricDepthOutput(prediction)
     np.testing.assert_array_equal(np.asarray(without.valid).reshape(depths.shape), depths > 0)
     with pytest.raises(AttributeError, match="no K"):
-        without.into(K_into, into, (32, 26))
+        without.reproject(K_into, into, (32, 26))
 
 
 def test_an_output_is_shown_by_its_size_range_and_verdicts():
@@ -129,16 +106,14 @@ def test_an_output_is_shown_by_its_size_range_and_verdicts():
     output = MetricDepthOutput(
         depth,
         verdicts=[verdict("not trusted", REASON), verdict("trusted")],
-        warnings=[REASON] * 2,
-        assumed=[REASON] * 3,
+        findings=[REASON] * 3,
     )
     text = repr(output)
     assert text.splitlines() == [
         "MetricDepthOutput(depth (1, 2, 2, 1), 1.5 to 7.25 m",
         f"  not trusted: {REASON}",
         "  trusted",
-        "  2 warnings",
-        "  3 assumptions)",
+        "  3 findings)",
     ]
     assert repr(MetricDepthOutput(torch.ones(1, 1, 2, 2), unit=None)).splitlines()[0].endswith("1 to 1")
 
@@ -146,12 +121,9 @@ def test_an_output_is_shown_by_its_size_range_and_verdicts():
 def test_the_points_of_a_frame_are_those_of_its_pixels_in_the_world():
     height, width = 5, 7
     depth = np.linspace(1.0, 3.0, height * width).reshape(height, width)
-    frame = DepthFrame("a", depth, np.ones_like(depth), K_LEFT, E)
-    every = frame.world().reshape(height, width, 3)
+    frame = posed_frame("a", depth, np.ones_like(depth), K_LEFT, E)
+    every = frame.world()
     for v, u in ((0, 0), (1, 5), (4, 2)):
         z = depth[v, u]
         x, y = (u - K_LEFT[0, 2]) / K_LEFT[0, 0] * z, (v - K_LEFT[1, 2]) / K_LEFT[1, 1] * z
         np.testing.assert_allclose(every[v, u], E[:3, :3] @ [x, y, z] + E[:3, 3])
-    mask = np.zeros(depth.shape, bool)
-    mask[1, 5] = mask[3, 0] = True
-    np.testing.assert_allclose(frame.world(mask), [every[1, 5], every[3, 0]])

@@ -1,4 +1,4 @@
-"""Methods side by side, by name (paper S5.1, S5.3)."""
+"""Registry of methods by name (paper S5.1, S5.3)."""
 
 from __future__ import annotations
 
@@ -7,33 +7,34 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.config import DEFAULT, PAPER
 from geodiff_plugin.evaluation.baselines.guided import GUIDED_METHODS, variant
 from geodiff_plugin.evaluation.baselines.method import Method, NotApplicable, Prediction, PriorCache, Settings
-from geodiff_plugin.evaluation.baselines.unguided import STEREO_METHODS, files_method, hf_method
+from geodiff_plugin.evaluation.baselines.unguided import MAP_USES, STEREO_METHODS, files_method, hf_method
 
 __all__ = ["FAMILIES", "METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
 __all__ += ["find_method"]
 
-#: Every method by name, in the order of the tables' columns.
+#: All methods by name, in the order of the tables' columns.
 METHODS: dict[str, Method] = {method.name: method for method in (*GUIDED_METHODS, *STEREO_METHODS)}
-#: Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter.
+#: Methods with a parameter: ``name:parameter`` calls the function of ``name`` with the parameter.
 FAMILIES: dict[str, Callable[[str], Method]] = {
     "guided": partial(variant, "guided", DEFAULT),
     "paper": partial(variant, "paper", PAPER),
     "hf": hf_method,
     "files": files_method,
-    "prior-map": partial(files_method, guided=True),
+    "prior-map": partial(files_method, use="prior-map"),
+    "points-map": partial(files_method, use="points-map"),
 }
 
 
 def find_method(name: str) -> Method:
-    """The method of a name, as ``guided``, ``hf:MODEL``, ``guided@org/prior#3``; else ``ValueError``."""
+    """Return a method by name, such as ``guided``, ``hf:MODEL``, ``guided@org/prior#3``."""
     if name in METHODS:
         return METHODS[name]
     family, colon, parameter = name.partition(":")
-    if colon and family in ("hf", "files", "prior-map"):  # an @ or # is part of their parameter
+    if colon and family in ("hf", *MAP_USES):  # their parameter may contain @ or #
         return FAMILIES[family](parameter)
     bare, _, seed = name.rpartition("#")
     if bare and seed.isdecimal():

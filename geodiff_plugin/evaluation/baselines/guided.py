@@ -1,4 +1,4 @@
-"""Methods that call the prior plainly, guide it, or guide something in its place."""
+"""Methods that run the prior without guidance, guide it, or guide a replacement."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Run = Callable[[StereoSample, Settings, PriorCache], Prediction]
 
 
 def call_arguments(settings: Settings) -> dict[str, Any]:
-    """Keywords of the pipeline call that ``settings`` decide, seeded afresh."""
+    """Return the keywords of the pipeline call determined by ``settings``, with a new seeded generator."""
     generator = torch.Generator(settings.device).manual_seed(settings.seed)
     given = {"num_inference_steps": settings.steps, "processing_resolution": settings.resolution}
     arguments = {name: value for name, value in given.items() if value is not None}
@@ -45,8 +45,8 @@ def call_arguments(settings: Settings) -> dict[str, Any]:
 
 
 def _notes(out: Any) -> dict[str, Any]:
-    """Scale, shift, poses and visibility of a guided result, as JSON values."""
-    notes: dict[str, Any] = {"warnings": list(out.warnings)}
+    """Return scale, shift, poses and visibility of a guided result as JSON values."""
+    notes: dict[str, Any] = {"findings": [finding.as_record() for finding in out.findings]}
     for name in ("scale", "shift", "global_scale"):
         values = getattr(out, name)
         if values is not None:
@@ -63,7 +63,7 @@ def _notes(out: Any) -> dict[str, Any]:
 def guided_prediction(
     pipe: Any, sample: StereoSample, guidance: GeometryGuidance, arguments: dict[str, Any]
 ) -> Prediction:
-    """The answer of one guided call of a pipeline with guidance enabled."""
+    """Return the prediction of one guided call of a pipeline with guidance enabled."""
     spread = arguments.get("ensemble_size", 1) > 1
     out = pipe(Image.fromarray(sample.left), guidance=guidance, output_uncertainty=spread, **arguments)
     uncertainty, confidence = (None if m is None else m[0, ..., 0] for m in (out.uncertainty, out.confidence))
@@ -73,12 +73,12 @@ def guided_prediction(
 
 
 def _plain_configuration(settings: Settings) -> dict[str, Any]:
-    without = ("prior", *(each.name for each in fields(SpeedOptions)))  # results are equal within rounding
+    without = ("prior", *(each.name for each in fields(SpeedOptions)))  # results are equal up to rounding
     return {key: value for key, value in asdict(settings).items() if key not in without}
 
 
 def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
-    """Every hyperparameter of a preset, the files of its decoder, every setting but the prior."""
+    """Return all hyperparameters of a preset, the files of its decoder, and all settings except the prior."""
     camera, pose = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]]), np.eye(4)
     pose[0, 3] = 0.1
     guidance = preset(np.zeros((32, 32, 3), np.uint8), camera, pose)
@@ -89,7 +89,7 @@ def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
 
 
 def posed_views(sample: StereoSample, views: int) -> tuple[Any, Any, Any]:
-    """``(right, K, E)`` of at most ``views`` views of a sample, as ``GeometryGuidance`` takes them."""
+    """Return ``(right, K, E)`` of at most ``views`` views of a sample for ``GeometryGuidance``."""
     more = sample.extra_views[: views - 2]
     if not more:
         return sample.right, (sample.K_left, sample.K_right), sample.E
@@ -97,31 +97,31 @@ def posed_views(sample: StereoSample, views: int) -> tuple[Any, Any, Any]:
     return images, (sample.K_left, *Ks), (np.eye(4), *Es)
 
 
-def _guidance(
+def guidance_of(
     sample: StereoSample, settings: Settings, priors: PriorCache, preset: Preset, **changes: Any
 ) -> GeometryGuidance:
-    """The guidance of a preset by a sample's views, with the evidence that other methods made of them."""
+    """Return a preset's guidance for a sample's views, reusing evidence computed by other methods."""
     guidance = preset(*posed_views(sample, settings.views), **changes)
-    guidance.evidence_store = priors.evidence
+    guidance.evidence_store, guidance.calibrated = priors.evidence, True
     guidance.measured_baseline = guidance.measured_baseline or sample.E_true is not None
     return guidance
 
 
 def _run_guided(preset: Preset, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-    guidance, pipe = _guidance(sample, settings, priors, preset), priors.get(settings)
+    guidance, pipe = guidance_of(sample, settings, priors, preset), priors.get(settings)
     if guidance.through_network and prior_of(pipe).network_input is None:
-        raise NotApplicable("no gradient to z_t, which this prior's network does not see")
+        raise NotApplicable("no gradient to z_t, which is not an input of this prior's network")
     return guided_prediction(pipe, sample, guidance, call_arguments(settings))
 
 
 def _guided(name: str, title: str, summary: str, preset: Preset, run: Run | None = None) -> Method:
-    """A method under one preset, which decides its result; it guides the prior unless it has a ``run``."""
+    """Return a method with one preset; it guides the prior unless it has a ``run``."""
     run = run or partial(_run_guided, preset)
     return Method(name, title, summary, run, partial(guided_configuration, preset), uses_prior=True)
 
 
 def _run_plain(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-    """The paper's row "Marigold": an oracle aligns what comes out."""
+    """Run the paper's row "Marigold": the output is aligned with ground truth."""
     pipe = priors.get(settings)
     out = pipe(Image.fromarray(sample.left), **call_arguments(settings))
     return Prediction(None, relative=out.prediction[0, ..., 0], space=prior_of(pipe).space)
@@ -130,17 +130,19 @@ def _run_plain(sample: StereoSample, settings: Settings, priors: PriorCache) -> 
 def guided_map(
     values: Any, space: str, sample: StereoSample, settings: Settings, priors: PriorCache, preset: Preset
 ) -> Prediction:
-    """A map ``(h, w)``, affine in ``space`` and not finite in holes, as the prior that a preset guides."""
+    """Guide a map ``(h, w)``, affine in ``space`` and not finite in holes, as a preset guides the prior."""
     pipe = priors.get(replace(settings, prior="map", space=space))
-    guidance = _guidance(sample, settings, priors, preset)
+    guidance = guidance_of(sample, settings, priors, preset)
     call = call_arguments(replace(settings, steps=None, ensemble=1)) | {"depth_map": values}
     return guided_prediction(pipe, sample, guidance, call)
 
 
 def _photometric_updates(right: Any, K: Any, E: Any) -> GeometryGuidance:
-    """Photometric error and pull only, started by the default's search, by Adam at the paper's rate."""
-    updates: dict[str, Any] = {"inner_steps": 50, "step_latents": 0.01, "min_steps": 1}
-    return GeometryGuidance(right, K, E, weights=PAPER.weights, correct=False, crisp=False, **updates)
+    """Update with photometric error and regularization only, initialised by the search, with Adam."""
+    updates: dict[str, Any] = {"guidance_steps": 50, "lr_latents": 0.01, "min_steps": 1}
+    return GeometryGuidance(
+        right, K, E, weights=PAPER.weights, fit_matches=False, refine_edges=False, **updates
+    )
 
 
 def _run_reprojection(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
@@ -153,44 +155,44 @@ def _run_reprojection(sample: StereoSample, settings: Settings, priors: PriorCac
 
 
 class RampPrior(DepthMapPipeline):
-    """One step to the latent of a ground plane, near at the bottom, by the ``adapter`` of another prior."""
+    """Predicts the latent of a ground plane, near at the bottom, in one step with a prior's ``adapter``."""
 
     adapter: Any
 
     def prepare_condition(self, image: Tensor, ensemble_size: int, *_: Any, **__: Any) -> dict[str, Tensor]:
-        """The ramp's latent, which is all that there is."""
+        """Return the ramp's latent."""
         near, far = (0.0, 1.0) if SPACES[self.adapter.space].grows_with_depth else (1.0, 0.0)
         rows = torch.linspace(far, near, image.shape[-2], device=image.device).view(1, 1, -1, 1)
         ramp = rows.expand(len(image), 1, -1, image.shape[-1])
         return {"image_latent": self.adapter.encode(ramp)}
 
     def decode(self, z0: Tensor) -> Tensor:
-        """By the prior's decoder."""
+        """Decode with the prior's decoder."""
         return self.adapter.decode(z0)
 
     def encode(self, x: Tensor) -> Tensor:
-        """By the prior's encoder."""
+        """Encode with the prior's encoder."""
         return self.adapter.encode(x)
 
 
 def _run_ramp(preset: Preset, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-    """A guided call on a ramp, with as many rounds of updates as the preset makes with this prior."""
+    """Make a guided call on a ramp, with as many rounds of updates as the preset uses with this prior."""
     pipe = priors.get(settings)
     adapter, of_preset = prior_of(pipe), preset(*posed_views(sample, settings.views))
     rounds = of_preset.denoising_steps(settings.steps, pipe.default_denoising_steps)
     ramp = RampPrior(DirectScheduler(), adapter.space, rounds, pipe.default_processing_resolution or 0)
     ramp.adapter, ramp.image_processor = adapter, pipe.image_processor
     ramp.to(pipe.device).set_progress_bar_config(disable=True)
-    guidance = _guidance(sample, settings, priors, preset, min_steps=rounds)
+    guidance = guidance_of(sample, settings, priors, preset, min_steps=rounds)
     arguments = {} if settings.resolution is None else {"processing_resolution": settings.resolution}
     return guided_prediction(enable_geometry_guidance(ramp), sample, guidance, arguments)
 
 
 def _run_estimated(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-    """The default preset with the poses withheld but for the length of the first baseline."""
+    """Run the default preset with estimated poses, given only the length of the first baseline."""
     more = sample.extra_views[: settings.views - 2]
     try:
-        guidance = GeometryGuidance.from_photographs(
+        guidance = GeometryGuidance.from_unposed_images(
             [sample.left, sample.right, *(image for image, _, _ in more)],
             K=[sample.K_left, sample.K_right, *(K for _, K, _ in more)],
             baseline_m=float(np.linalg.norm(sample.E[:3, 3])),
@@ -200,32 +202,34 @@ def _run_estimated(sample: StereoSample, settings: Settings, priors: PriorCache)
     return guided_prediction(priors.get(settings), sample, guidance, call_arguments(settings))
 
 
-_PLAIN = "the stock pipeline, scale and shift by least squares against the truth"
-_SEARCH = "the search for the scale alone: no correction, no gradient updates, no refinement"
-_FIT = "a plain call, fitted to the matches and refined once: no guided step"
-_UPDATES = "no diffusion: the prior's map, its pixels moved by 50 updates of the photometric error"
-_RAMP = "the default preset without the U-Net: its search, corrections and refinement on a ramp's latent"
-_AFFINE = partial(GeometryGuidance, optimize_latents=False, crisp=False)
-_BELIEVING = partial(GeometryGuidance, reject_reflections=False)  # a ramp contradicts nothing
+_PLAIN = "the stock pipeline, scale and shift fitted to ground truth by least squares"
+_SEARCH = "scale search only: no match fitting, no gradient updates, no refinement"
+_FIT = "a single fit to the matches and one refinement: no guided steps"
+_UPDATES = "no diffusion: 50 photometric updates of the prior's map"
+_RAMP = "the default preset without the U-Net: search, match fitting and refinement on a ramp's latent"
+_AFFINE = partial(GeometryGuidance, optimize_latents=False, refine_edges=False)
+_BELIEVING = partial(GeometryGuidance, reject_reflections=False)  # a ramp contradicts no reflection
 
 GUIDED_METHODS = (
     Method("prior-aligned", "prior + oracle", _PLAIN, _run_plain, _plain_configuration, uses_prior=True),
     _guided("search-only", "search only", _SEARCH, GeometryGuidance.search_only),
-    _guided("scale-shift-only", "scale, shift", "the default preset on scale and shift only", _AFFINE),
-    _guided("paper", "paper", "the prior guided with the paper's own numbers", GeometryGuidance.paper),
+    _guided(
+        "scale-shift-only", "scale, shift", "the default preset optimizing scale and shift only", _AFFINE
+    ),
+    _guided("paper", "paper", "the prior guided with the paper's parameters", GeometryGuidance.paper),
     _guided("prior-fit", "prior fit", _FIT, partial(GeometryGuidance, config=PRIOR_FIT)),
     _guided("guided", "guided", "the prior guided with the default preset", GeometryGuidance),
-    _guided("fast", "fast", "the prior guided with the preset fast", partial(GeometryGuidance, config=FAST)),
+    _guided("fast", "fast", "the prior guided with the fast preset", partial(GeometryGuidance, config=FAST)),
     _guided("reprojection-only", "reprojection only", _UPDATES, _photometric_updates, _run_reprojection),
     _guided("no-diffusion", "no diffusion", _RAMP, _BELIEVING, partial(_run_ramp, _BELIEVING)),
 )
 
 
 def variant(base: str, config: GuidanceConfig, text: str) -> Method:
-    """A preset with some knobs changed; ``knob=value``, several joined by ``+``; ``pose=estimated``."""
+    """Return a preset with changed parameters (``name=value``, joined by ``+``), or ``pose=estimated``."""
     name = f"{base}:{text}"
     if name == "guided:pose=estimated":
-        summary = "the prior guided with the default preset, poses estimated from the photographs"
+        summary = "the prior guided with the default preset, poses estimated from the images"
         return _guided(name, "guided, poses estimated", summary, GeometryGuidance, _run_estimated)
     changed = config_from_text(text.split("+"), config, "methods")
     title, preset = f"{base}, {text.replace('+', ', ')}", partial(GeometryGuidance, config=changed)

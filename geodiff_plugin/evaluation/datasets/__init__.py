@@ -1,4 +1,4 @@
-"""Data sets in their official layouts (paper S5.1), and which of their samples a command takes."""
+"""Data sets in their official layouts (paper S5.1), and the selection of samples."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.evaluation.datasets.layouts import LAYOUTS
+from geodiff_plugin.evaluation.datasets.middlebury import MIDDLEBURY
 from geodiff_plugin.evaluation.datasets.sample import (
     CHANGES,
     Dataset,
@@ -20,16 +21,18 @@ from geodiff_plugin.evaluation.datasets.sample import (
     changed_ref,
     two_numbers,
 )
+from geodiff_plugin.evaluation.datasets.scannet import SCANNET
+from geodiff_plugin.evaluation.datasets.splits import split_of
 from geodiff_plugin.evaluation.options import SampleOptions
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load"]
 
-#: Every data set by name, in the order in which results are listed.
-DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in LAYOUTS}
+#: All data sets by name, in the order of the results.
+DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in (*LAYOUTS, *MIDDLEBURY, SCANNET)}
 
 
 def load(ref: SampleRef) -> StereoSample:
-    """Read the sample that ``ref`` points to, and change it as ``ref`` asks."""
+    """Read the sample of ``ref``, and apply its change."""
     sample = DATASETS[ref.dataset].load(ref)
     for key, (_, changed) in CHANGES.items():
         if key in ref.files:
@@ -38,7 +41,7 @@ def load(ref: SampleRef) -> StereoSample:
 
 
 def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **options: object) -> list[SampleRef]:
-    """References to every metric pair of the ``datasets`` below ``root``; ``options`` are for some sets."""
+    """Find references to all metric pairs of the ``datasets`` in ``root``; ``options`` apply to some sets."""
     root = Path(root)
     refs = []
     for name in DATASETS if datasets is None else datasets:
@@ -53,40 +56,55 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
 
 
 def data_of(options: Any) -> Path:
-    """Where the samples are: what was given, or the pair that ships with the package."""
+    """Return the folder of the samples: the given one, or the bundled pair."""
     return options.data or DEMO_PAIR_FOLDER
 
 
 def all_refs(options: SampleOptions, datasets: Sequence[str] = ()) -> list[SampleRef]:
-    """References to all samples of the data: of the named data sets, else of those that the options name."""
+    """Return references to all samples of the named data sets, or of those in the options."""
     given = {name: getattr(options, name, None) for name in ("pairs", "pixel_centre")}
     return find_pairs(data_of(options), datasets or options.datasets or None, **given)
 
 
+def in_split(refs: Sequence[SampleRef], split: str, data: Path) -> list[SampleRef]:
+    """Return samples of a split, a key of ``SPLITS``, or all for "all"; ``ValueError`` if there are none."""
+    kept = [ref for ref in refs if split == "all" or split_of(ref.dataset, ref.name) == split]
+    if refs and not kept:
+        found = ", ".join(ref.label for ref in refs)
+        hint = "geodiff_plugin/evaluation/datasets/splits.toml lists both splits."
+        bad_value(
+            "DIR (--data)", f"a folder with a sample of the split '{split}'", f"{data} with {found}", hint
+        )
+    return kept
+
+
 def some_pairs(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> list[SampleRef]:
-    """The samples whose label contains one of ``scenes``; ``ValueError`` for none, or for two of one name."""
+    """Return samples whose label contains one of ``scenes``; ``ValueError`` for none, or equal labels."""
     kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
     if not kept:
-        there = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
+        found = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
         wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
-        cure = (
-            "A pair of your own is a folder of left.png, right.png, calib.txt and depth.npy. geodiff eval "
-            "list says how to obtain the public ones; docs/how-to/extending.md adds others."
+        hint = (
+            "For your own pair, create a folder with left.png, right.png, calib.txt and depth.npy. "
+            "geodiff eval list states "
+            "how to obtain public data sets; docs/how-to/extending.md describes how to add others."
         )
-        bad_value("DIR (--data)", f"a folder with a sample{wanted}", f"{data} with {there}", cure)
-    # As two resolutions of a set have: records could not tell them apart.
+        bad_value("DIR (--data)", f"a folder with a sample{wanted}", f"{data} with {found}", hint)
+    # E.g. two resolutions of a set, whose records would be indistinguishable.
     label, count = Counter(ref.label for ref in kept).most_common(1)[0]
     if count > 1:
-        cure = "Name the folder of one of them, for instance that of one resolution."
+        hint = "Pass the folder of one of them, such as one resolution."
         bad_value(
-            "DIR (--data)", "a folder with one sample of each name", f"{data} with several {label}", cure
+            "DIR (--data)", "a folder with one sample of each name", f"{data} with several {label}", hint
         )
     return kept
 
 
 def select(options: SampleOptions, refs: Sequence[SampleRef] | None = None) -> list[SampleRef]:
-    """The samples that ``scenes`` names, ``sample`` drawn of them, the first ``limit``, some perturbed."""
-    kept = some_pairs(all_refs(options) if refs is None else refs, data_of(options), options.scenes)
+    """Select samples by ``split`` and ``scenes``, draw ``sample``, keep the first ``limit``, perturb them."""
+    data = data_of(options)
+    refs = in_split(all_refs(options) if refs is None else refs, getattr(options, "split", "all"), data)
+    kept = some_pairs(refs, data, options.scenes)
     count = getattr(options, "sample", None)
     if count is not None:
         if count > len(kept):

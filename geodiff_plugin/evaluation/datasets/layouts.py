@@ -1,8 +1,7 @@
-"""Readers of data sets in their official layouts, and of the user's own folders (S5.1, Tables 1 to 3)."""
+"""Reads data sets in their official layouts, and the user's own folders (S5.1, Tables 1 to 3)."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -14,64 +13,42 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin._internal.checks import bad_value, check_choice
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.evaluation.datasets.sample import (
     Dataset,
     ExtraView,
     Images,
     SampleRef,
     StereoSample,
+    check_size,
     disparity_to_depth,
+    existing,
+    folders,
+    like,
     make_sample,
     read_depth_m,
     read_rgb,
+    step_px,
 )
-from geodiff_plugin.formats import read_calibration, read_depth_png, read_text
-from geodiff_plugin.formats.depth import read_map
-from geodiff_plugin.geometry import resize_intrinsics
+from geodiff_plugin.formats import read_calibration, read_depth_png, read_map, read_text
 from geodiff_plugin.types import Rig
 
 
 def _read_pair(ref: SampleRef) -> tuple[Images, Rig]:
-    """Images and rig of the files ``left``, ``right``, ``calibration`` and, if any, ``calibration_right``."""
+    """Read images and rig from the files ``left``, ``right``, ``calibration`` and ``calibration_right``."""
     files, second = ref.files, ref.files.get("calibration_right")
     left, right, first = files["left"], files["right"], files["calibration"]
     images = read_rgb(left, "left image"), read_rgb(right, "right image")
     given, names = first if second is None else (first, second), (left.name, right.name)
-    size = {"image_names": names, "image_size": images[0].shape[1::-1]}
-    rig = read_calibration(given, files.get("cameras"), str(left), **size)
+    height, width = images[0].shape[:2]
+    hint, left_size = str(left), (width, height)
+    rig = read_calibration(given, files.get("cameras"), hint, image_names=names, image_size=left_size)
     sizes = (first, rig.size_left, "left"), (second or first, rig.size_right, "right")
     for image, (path, size, side) in zip(images, sizes, strict=True):
         if size is not None:
-            _check_size(path, size[::-1], image.shape, side)
+            check_size(path, size[::-1], image.shape, side)
     return images, rig
-
-
-def _folders(root: Path, depth: int) -> list[Path]:
-    """``root`` and the folders below it down to ``depth`` levels, sorted."""
-    levels = [[root] if os.path.isdir(root) else []]
-    for _ in range(depth):
-        below = chain.from_iterable(sorted(parent.iterdir()) for parent in levels[-1])
-        levels.append([path for path in below if path.is_dir()])
-    return list(chain(*levels))
-
-
-def _check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...], side: str = "left") -> None:
-    """Raise ``ValueError`` naming ``path`` where its ``(H, W)`` is not that of the image of a ``side``."""
-    if tuple(got[:2]) != tuple(expected[:2]):
-        size = f"for {expected[1]} x {expected[0]} pixels as the {side} image"
-        cure = "Image, calibration and truth must be of one resolution."
-        bad_value(str(path), size, f"{got[1]} x {got[0]}", cure)
-
-
-def _existing(path: Path) -> Path | None:
-    return path if path.is_file() else None
-
-
-def _like(image: np.ndarray, path: Path, values: np.ndarray) -> np.ndarray:
-    """The values of a file, which must be as many as the image's pixels."""
-    _check_size(path, values.shape, image.shape)
-    return values
 
 
 class _KittiViews(NamedTuple):
@@ -83,7 +60,7 @@ class _KittiViews(NamedTuple):
 
 
 class _KittiYear(NamedTuple):
-    """Folders below ``training``: views, the better first; calibrations; truth of all and of some pixels."""
+    """Folders in ``training``: views, best first; calibrations; ground truth of all and of some pixels."""
 
     views: tuple[_KittiViews, ...]
     calibrations: str
@@ -111,94 +88,106 @@ _KITTI_2012 = _KittiYear(
 
 
 def _find_kitti(root: Path, name: str, year: _KittiYear) -> list[SampleRef]:
-    """Pairs below ``training``, its parent or that one's: colour before grey, all pixels before fewer."""
+    """Find pairs in ``training`` or its parents: colour before grey, all pixels before fewer."""
     refs = []
-    for folder in _folders(root, 3):
-        there = [views for views in year.views if (folder / views.left).is_dir()]
-        if not there or not any((folder / truth).is_dir() for truth in (year.occ, year.noc)):
+    for folder in folders(root, 3):
+        available = [views for views in year.views if (folder / views.left).is_dir()]
+        if not available or not any(
+            (folder / ground_truth).is_dir() for ground_truth in (year.occ, year.noc)
+        ):
             continue
-        for left in sorted((folder / there[0].left).glob("*_10.png")):
+        for left in sorted((folder / available[0].left).glob("*_10.png")):
             occ, noc = folder / year.occ / left.name, folder / year.noc / left.name
             files = {
                 "left": left,
-                "right": folder / there[0].right / left.name,
-                "disparity": _existing(occ) or _existing(noc) or occ,
-                "noc": _existing(noc) if occ.is_file() else None,
+                "right": folder / available[0].right / left.name,
+                "disparity": existing(occ) or existing(noc) or occ,
+                "noc": existing(noc) if occ.is_file() else None,
                 "calibration": folder / year.calibrations / f"{left.stem[:-3]}.txt",
-                "cameras": there[0].cameras,
+                "cameras": available[0].cameras,
             }
             refs.append(SampleRef(name, left.stem[:-3], files))
     return refs
 
 
 def _load_kitti(ref: SampleRef) -> StereoSample:
-    """Read one KITTI pair; ``occluded`` where both kinds of truth exist."""
-    (images, rig), truth, noc = _read_pair(ref), ref.files["disparity"], ref.files["noc"]
-    disparity, valid = read_depth_png(truth, 256.0, "true disparity")
+    """Read one KITTI pair; ``occluded`` is set if ground truth without occluded pixels exists."""
+    (images, rig), ground_truth, noc = _read_pair(ref), ref.files["disparity"], ref.files["noc"]
+    noc_only = ground_truth.parent.name.startswith("disp_noc")
+    disparity, valid = read_depth_png(ground_truth, 256.0, "ground-truth disparity")
     occluded = None
     if noc is not None:
-        _, seen_twice = read_depth_png(noc, 256.0, "disparity of the pixels seen twice")
-        occluded = valid & ~_like(images[0], noc, seen_twice)
-    depth_m = disparity_to_depth(_like(images[0], truth, disparity), rig.K_left, rig.K_right, rig.E)
-    notes = {"truth": truth.parent.name, "disparity_step_px": 1 / 256}
+        _, seen_twice = read_depth_png(noc, 256.0, "disparity of non-occluded pixels")
+        occluded = valid & ~like(images[0], noc, seen_twice)
+    elif noc_only:
+        occluded = np.zeros_like(valid)
+    depth_m = disparity_to_depth(like(images[0], ground_truth, disparity), rig.K_left, rig.K_right, rig.E)
+    notes = {"truth": ground_truth.parent.name, "disparity_step_px": 1 / 256, "noc_only": noc_only}
     return make_sample(ref, images, rig, np.where(valid, depth_m, 0), notes, occluded=occluded)
 
 
-#: Folders of scenes whose truth is not published; the archives of the images have them as well.
+#: Scene folders without public ground truth, which are also in the image archives.
 _TESTS = ("testF", "testH", "testQ", "two_view_test")
 
 
+#: Scenes of Middlebury 2021, each with one to three numbered pairs.
+_SCENES_2021 = (
+    *("artroom", "bandsaw", "chess", "curule", "ladder", "octogons"),
+    *("pendulum", "podium", "skates", "skiboots", "traproom"),
+)
+
+
+def _set_of_scene(root: Path, folder: Path, ground_truth: Path) -> str:
+    """Return the data set of a folder in Middlebury's format, from the names of folders and files."""
+    parts = (root.resolve().name, *folder.relative_to(root).parts)
+    if any("eth3d" in part.lower() or "two_view" in part for part in parts):
+        return "eth3d"
+    if ground_truth.name == "disp0GT.pfm":
+        return "middeval3"
+    return "middlebury2021" if folder.name.rstrip("0123456789") in _SCENES_2021 else "middlebury2014"
+
+
 def _find_scenes(root: Path, name: str) -> list[SampleRef]:
-    """Folders in Middlebury's format of the set that a folder's name, else the truth's, says; with truth."""
+    """Find folders in Middlebury's format with ground truth; folder or file names determine the set."""
     refs = []
-    for folder in _folders(root, 3):
+    for folder in folders(root, 3):
         if not ((folder / "im0.png").is_file() and (folder / "calib.txt").is_file()):
             continue
-        beside = folder.parent.parent / "two_view_training_gt" / folder.name / "disp0GT.pfm"
-        truths = map(_existing, (folder / "disp0.pfm", folder / "disp0GT.pfm", beside))
-        truth = next(filter(None, truths), folder / "disp0.pfm")
-        dataset = "middeval3" if truth.name == "disp0GT.pfm" else "middlebury2014"
-        parts = (root.resolve().name, *folder.relative_to(root).parts)
-        if any("eth3d" in part.lower() or "two_view" in part for part in parts):
-            dataset = "eth3d"
-        if dataset == name and (truth.is_file() or folder.parent.name not in _TESTS):
+        separate = folder.parent.parent / "two_view_training_gt" / folder.name / "disp0GT.pfm"
+        ground_truths = map(existing, (folder / "disp0.pfm", folder / "disp0GT.pfm", separate))
+        ground_truth = next(filter(None, ground_truths), folder / "disp0.pfm")
+        dataset = _set_of_scene(root, folder, ground_truth)
+        if dataset == name and (ground_truth.is_file() or folder.parent.name not in _TESTS):
             names = {"left": "im0.png", "right": "im1.png", "calibration": "calib.txt"}
             files: dict[str, Any] = {key: folder / file for key, file in names.items()}
-            files |= {"disparity": truth, "mask": _existing(truth.parent / "mask0nocc.png")}
+            files |= {"disparity": ground_truth, "mask": existing(ground_truth.parent / "mask0nocc.png")}
             refs.append(SampleRef(name, folder.name, files))
     return refs
 
 
-def _step_px(disparity: np.ndarray) -> float:
-    """Coarseness of the truth: gap between neighbouring values, 0 where as good as continuous."""
-    gaps = np.diff(np.unique(disparity))
-    # Float truth has gaps far below a sixteenth of a pixel; truth that was made from 8-bit maps has none.
-    return float(gaps.min()) if gaps.size and gaps.min() > 1 / 16 else 0.0
-
-
 def _load_scene(ref: SampleRef) -> StereoSample:
-    """Read one pair in Middlebury's format; its mask is 128 for hidden on the right, 0 for unknown."""
-    (images, rig), truth, mask = _read_pair(ref), ref.files["disparity"], ref.files["mask"]
-    disparity = _like(images[0], truth, read_map(truth, "true disparity"))
+    """Read one pair in Middlebury's format; its mask is 128 for occluded in the right view, 0 for unknown."""
+    (images, rig), ground_truth, mask = _read_pair(ref), ref.files["disparity"], ref.files["mask"]
+    disparity = like(images[0], ground_truth, read_map(ground_truth, "ground-truth disparity"))
     valid, occluded = np.isfinite(disparity), None
     if mask is not None:
-        seen = read_rgb(mask, "mask of pixels seen twice")[..., 0]
-        occluded = valid & (_like(images[0], mask, seen) == 128)
+        seen = read_rgb(mask, "mask of non-occluded pixels")[..., 0]
+        occluded = valid & (like(images[0], mask, seen) == 128)
     depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
-    notes = {"truth": truth.name, "disparity_step_px": _step_px(disparity[valid])}
+    notes = {"truth": ground_truth.name, "disparity_step_px": step_px(disparity[valid])}
     return make_sample(ref, images, rig, depth_m, notes, occluded=occluded)
 
 
-#: Booster's images of 12 megapixels are scored at a quarter of their size, as the set's authors do.
+#: Booster's 12 megapixel images are scored at a quarter of their size, as by the authors.
 SHRINK = 4
-#: Every fourth value: truth and classes must not be mixed across edges.
+#: Every fourth value, because ground truth and classes must not be mixed across edges.
 _EVERY = np.s_[SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK]
 
 
 def _find_booster(root: Path, name: str) -> list[SampleRef]:
-    """Every image pair of every scene of the balanced split, which has one truth and several lightings."""
+    """Find all image pairs of the balanced split, which has one ground truth and several lightings."""
     refs = []
-    for scene in _folders(root, 3):
+    for scene in folders(root, 3):
         if not ((scene / "camera_00").is_dir() and (scene / "camera_02").is_dir()):
             continue
         names = {"disparity": "disp_00.npy", "occluded": "mask_00.png", "material": "mask_cat.png"}
@@ -210,38 +199,38 @@ def _find_booster(root: Path, name: str) -> list[SampleRef]:
     return refs
 
 
-def _quartered(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``(H / 4, W / 4, 3)`` uint8, mean over squares of four by four pixels, and its intrinsics."""
+def _quartered(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
+    """Return ``(H / 4, W / 4, 3)`` uint8, averaged over 4 x 4 pixels, and its camera."""
     planes = torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None]
     shrunk = np.rint(F.avg_pool2d(planes, SHRINK)[0].permute(1, 2, 0).numpy()).astype(np.uint8)
-    sizes = image.shape[:2], shrunk.shape[:2]
-    return shrunk, resize_intrinsics(torch.from_numpy(K)[None], *sizes)[0].numpy()
+    (height, width), (rows, columns) = image.shape[:2], shrunk.shape[:2]
+    return shrunk, replace(camera, size=(width, height)).resized((columns, rows))
 
 
 def _load_booster(ref: SampleRef) -> StereoSample:
-    """Read one pair at a quarter of its size; where there are masks, ``occluded`` is 0 for hidden."""
+    """Read one pair at a quarter of its size; in masks, 0 of ``occluded`` means occluded."""
     files = ref.files
     (left, right), rig = _read_pair(ref)
     if any(side % SHRINK for side in (*left.shape[:2], *right.shape[:2])):
         bad_value(str(files["left"]), f"of sides that are multiples of {SHRINK}", left.shape[:2])
-    disparity = _like(left, files["disparity"], read_map(files["disparity"], "true disparity"))
+    disparity = like(left, files["disparity"], read_map(files["disparity"], "ground-truth disparity"))
     depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
     depth_m = np.where(disparity > 0, depth_m, 0)[_EVERY]
     masks = {
-        name: _like(left, files[name], read_rgb(files[name], f"{name} mask")[..., 0])[_EVERY]
+        name: like(left, files[name], read_rgb(files[name], f"{name} mask")[..., 0])[_EVERY]
         for name in ("occluded", "material")
         if files[name].is_file()
     }
     if "occluded" in masks:
         masks["occluded"] = (masks["occluded"] == 0) & (depth_m > 0)
-    (left, K_left), (right, K_right) = _quartered(left, rig.K_left), _quartered(right, rig.K_right)
-    rig, notes = replace(rig, K_left=K_left, K_right=K_right), {"truth": "disp_00.npy"}
+    (left, of_left), (right, of_right) = _quartered(left, rig.left), _quartered(right, rig.right)
+    rig, notes = replace(rig, left=of_left, right=of_right), {"truth": "disp_00.npy"}
     return make_sample(ref, (left, right), rig, depth_m, notes | {"disparity_step_px": 0.0}, **masks)
 
 
-#: Further views of the reference that a posed sample brings along, the best ones first.
-MOST_OTHERS = 4
-#: The views with filtered truth that the Robust Multi-View Depth Benchmark scores: 18, 25, 13 and 13.
+#: Maximum number of further views of a posed sample, best first.
+MAX_OTHER_VIEWS = 4
+#: Numbers of key views with filtered ground truth in the Robust Multi-View Depth Benchmark.
 KEY_VIEWS: dict[str, tuple[int, ...]] = {
     "Barn": tuple(range(60, 401, 20)),
     "Church": tuple(range(10, 491, 20)),
@@ -251,7 +240,7 @@ KEY_VIEWS: dict[str, tuple[int, ...]] = {
 
 
 def _sources_of(path: Path) -> dict[int, list[int]]:
-    """For every reference view of a ``pair.txt`` its source views, best first, in the file's order."""
+    """Return the source views of every reference view in a ``pair.txt``, best first."""
     lines = [line.split() for line in read_text(path, "list of view pairs").splitlines() if line.strip()]
     try:
         sources = {}
@@ -265,7 +254,7 @@ def _sources_of(path: Path) -> dict[int, list[int]]:
 
 
 def _posed_views(group: Path, every: bool, benchmark: bool) -> list[list[int]]:
-    """For each sample of a group its left view, the right one, and all that may come along, best first."""
+    """Return left, right and further views, best first, for each sample of a group."""
     sources = _sources_of(group / "pair.txt")
     if not (every or benchmark):
         views = sorted({*sources, *chain(*sources.values())})
@@ -275,48 +264,60 @@ def _posed_views(group: Path, every: bool, benchmark: bool) -> list[list[int]]:
 
 
 def _find_posed(root: Path, name: str, pairs: str = "default", pixel_centre: float = 0.0) -> list[SampleRef]:
-    """Groups with ``images``, ``cams`` and ``pair.txt``; one pair of each, or of each key view.
+    """Find groups with ``images``, ``cams`` and ``pair.txt``; one pair per group or key view.
 
     ``pairs="all"``: every listed pair. ``pixel_centre`` is the coordinate of the top-left pixel's centre.
     """
     check_choice(pairs, "pairs", ("default", "all"))
     refs, every, benchmark = [], pairs == "all", name == "robustmvd"
-    for group in _folders(root, 2):
-        there = (group / "pair.txt").is_file() and (group / "cams").is_dir() and (group / "images").is_dir()
-        if not there or benchmark != (group.name in KEY_VIEWS and (group / "depth").is_dir()):
+    for group in folders(root, 2):
+        complete = (
+            (group / "pair.txt").is_file() and (group / "cams").is_dir() and (group / "images").is_dir()
+        )
+        if not complete or benchmark != (group.name in KEY_VIEWS and (group / "depth").is_dir()):
             continue
         for left, right, *others in _posed_views(group, every, benchmark):
             label = f"{group.name}-{left}-{right}" if every or benchmark else group.name
             others = list(dict.fromkeys(view for view in others if view not in (left, right)))
-            taken = (left, right, *others[:MOST_OTHERS])
-            # The benchmark's truth is counted from 1, as its scans are.
-            truth = f"depth/{left + 1:06d}.npz" if benchmark else f"depths/{left:08d}.pfm"
-            files: dict[str, Any] = {"views": taken, "pixel_centre": pixel_centre, "truth": group / truth}
+            taken = (left, right, *others[:MAX_OTHER_VIEWS])
+            # The benchmark counts ground truth and scans from 1.
+            ground_truth = f"depth/{left + 1:06d}.npz" if benchmark else f"depths/{left:08d}.pfm"
+            files: dict[str, Any] = {
+                "views": taken,
+                "pixel_centre": pixel_centre,
+                "truth": group / ground_truth,
+            }
             names = [("left", "calibration"), ("right", "calibration_right")]
             names += [(f"image {view}", f"camera {view}") for view in taken[2:]]
             for view, (image, camera) in zip(taken, names, strict=True):
                 images = [group / "images" / f"{view:08d}{suffix}" for suffix in (".png", ".jpg", ".jpeg")]
-                files[image] = next(filter(_existing, images), images[0])
+                files[image] = next(filter(existing, images), images[0])
                 files[camera] = group / "cams" / f"{view:08d}_cam.txt"
             refs.append(SampleRef(name, label, files))
     return refs
 
 
 def _load_posed(ref: SampleRef) -> StereoSample:
-    """Read one posed pair, whose truth may be missing; the camera files' depth numbers are never used."""
+    """Read one posed pair, possibly without ground truth; ignores the depth range in camera files."""
     (images, rig), files = _read_pair(ref), ref.files
-    truth, half, extra = files["truth"], np.zeros((3, 3)), []
-    half[:2, 2] = files["pixel_centre"]
+    ground_truth, extra = files["truth"], []
+
+    def from_centre(camera: Camera) -> Camera:
+        """Return the camera with the centre of its first pixel at 0."""
+        K = camera.K.copy()
+        K[:2, 2] -= files["pixel_centre"]
+        return replace(camera, K=K)
+
     for view in files["views"][2:]:
         image, camera = read_rgb(files[f"image {view}"], "further image"), files[f"camera {view}"]
         pose = read_calibration((files["calibration"], camera))
-        extra.append(ExtraView(image, pose.K_right - half, pose.E))
-    depth_m, named = np.zeros(images[0].shape[:2], np.float32), f"no {truth}"
-    if truth.is_file() or ref.dataset == "robustmvd":
-        depth_m = _like(images[0], truth, read_map(truth, "true depth"))
-        named = f"{truth.parent.name}/{truth.name}"
+        extra.append(ExtraView(image, from_centre(pose.right).K, pose.E))
+    depth_m, named = np.zeros(images[0].shape[:2], np.float32), f"no {ground_truth}"
+    if ground_truth.is_file() or ref.dataset == "robustmvd":
+        depth_m = like(images[0], ground_truth, read_map(ground_truth, "ground-truth depth"))
+        named = f"{ground_truth.parent.name}/{ground_truth.name}"
     notes = {"truth": named, "views": files["views"][:2]}
-    shifted = replace(rig, K_left=rig.K_left - half, K_right=rig.K_right - half)
+    shifted = replace(rig, left=from_centre(rig.left), right=from_centre(rig.right))
     return make_sample(ref, images, shifted, depth_m, notes, extra_views=tuple(extra))
 
 
@@ -324,16 +325,16 @@ _DEPTHS = ("depth.npy", "depth.pfm", "depth.png", "depth_mm.png")
 
 
 def _image(folder: Path, stem: str) -> Path | None:
-    """The image file of this name that Pillow knows, a PNG before others."""
+    """Return the image file with this name, PNG preferred."""
     Image.init()
     listed = [p for p in folder.glob(f"{stem}.*") if p.is_file() and p.suffix.lower() in Image.EXTENSION]
     return min(listed, key=lambda path: (path.suffix.lower() != ".png", path.name), default=None)
 
 
 def _find_folders(root: Path, name: str) -> list[SampleRef]:
-    """``root`` and the folders right below it with two of left, right and calib; reading names the third."""
+    """Find ``root`` and its subfolders with two of left, right and calib; reading reports the missing one."""
     refs = []
-    for folder in _folders(root, 1):
+    for folder in folders(root, 1):
         left, right = _image(folder, "left"), _image(folder, "right")
         single = sorted(folder.glob("calib.*"))
         pair = [*sorted(folder.glob("calib_left.*"))[:1], *sorted(folder.glob("calib_right.*"))[:1]]
@@ -346,31 +347,32 @@ def _find_folders(root: Path, name: str) -> list[SampleRef]:
             "right": right or folder / "right.png",
             "calibration": cameras[0],
             "calibration_right": cameras[1] if len(cameras) > 1 else None,
-            "depth": next(filter(None, (_existing(folder / depth) for depth in _DEPTHS)), None),
+            "depth": next(filter(None, (existing(folder / depth) for depth in _DEPTHS)), None),
         }
         refs.append(SampleRef(name, folder.resolve().name, files))
     return refs
 
 
 def _load_folder(ref: SampleRef) -> StereoSample:
-    """Read one pair; without depth ``valid`` is False everywhere, and the notes say what was sought."""
+    """Read one pair; without depth ``valid`` is False everywhere, and the notes state what was searched."""
     (images, rig), path = _read_pair(ref), ref.files["depth"]
     depth_m = np.zeros(images[0].shape[:2], np.float32)
-    truth = f"no {', '.join(_DEPTHS[:-1])} or {_DEPTHS[-1]} in {ref.files['left'].parent}"
+    ground_truth = f"no {', '.join(_DEPTHS[:-1])} or {_DEPTHS[-1]} in {ref.files['left'].parent}"
     if path is not None:
-        depth_m, truth = _like(images[0], path, read_depth_m(path, "depth")), path.name
-    return make_sample(ref, images, rig, depth_m, {"truth": truth})
+        depth_m, ground_truth = like(images[0], path, read_depth_m(path, "depth")), path.name
+    return make_sample(ref, images, rig, depth_m, {"truth": ground_truth})
 
 
-#: Options of finding posed pairs, beside the folder.
+#: Options for finding posed pairs, in addition to the folder.
 _POSED = ("pairs", "pixel_centre")
-#: Every set, in the order in which results are listed.
+#: All data sets, in the order of the results.
 LAYOUTS = [
     Dataset(
         name="kitti2015",
         find=partial(_find_kitti, name="kitti2015", year=_KITTI_2015),
         load=_load_kitti,
         cap_m=80.0,
+        bad_px=3.0,
         obtain="data_scene_flow.zip and data_scene_flow_calib.zip from "
         "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), in one folder.",
     ),
@@ -379,6 +381,7 @@ LAYOUTS = [
         find=partial(_find_kitti, name="kitti2012", year=_KITTI_2012),
         load=_load_kitti,
         cap_m=80.0,
+        bad_px=3.0,
         obtain="data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
         "(CC BY-NC-SA 3.0).",
     ),
@@ -387,6 +390,7 @@ LAYOUTS = [
         find=partial(_find_scenes, name="middlebury2014"),
         load=_load_scene,
         cap_m=None,
+        bad_px=2.0,
         obtain="scene folders from https://vision.middlebury.edu/stereo/data/scenes2014/ "
         "(free with citation).",
     ),
@@ -395,6 +399,7 @@ LAYOUTS = [
         find=partial(_find_scenes, name="middeval3"),
         load=_load_scene,
         cap_m=None,
+        bad_px=2.0,
         obtain="MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
         "https://vision.middlebury.edu/stereo/submit3/, in one folder.",
     ),
@@ -403,6 +408,7 @@ LAYOUTS = [
         find=partial(_find_scenes, name="eth3d"),
         load=_load_scene,
         cap_m=None,
+        bad_px=1.0,
         obtain="two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets "
         "(CC BY-NC-SA 4.0), in folders of these names.",
     ),
@@ -418,8 +424,8 @@ LAYOUTS = [
         find=partial(_find_posed, name="mvsnet"),
         load=_load_posed,
         cap_m=None,
-        obtain="folders of images/, cams/ and pair.txt as MVSNet code circulates Tanks and Temples; "
-        "for the numbers here also depths/*.pfm in metres.",
+        obtain="folders of images/, cams/ and pair.txt in the MVSNet layout of Tanks and Temples; "
+        "metrics also need depths/*.pfm in metres.",
         options=_POSED,
     ),
     Dataset(
@@ -428,8 +434,8 @@ LAYOUTS = [
         load=_load_posed,
         cap_m=None,
         obtain="tanks_and_temples_images.zip and tanks_and_temples_depth.zip of "
-        "https://github.com/lmb-freiburg/robustmvd; then cams/ and pair.txt from its sample list as "
-        "docs/how-to/evaluation.md shows.",
+        "https://github.com/lmb-freiburg/robustmvd; then create cams/ and pair.txt from its sample list as "
+        "described in docs/how-to/evaluation.md.",
         options=_POSED,
     ),
     Dataset(
@@ -437,6 +443,16 @@ LAYOUTS = [
         find=partial(_find_folders, name="folder"),
         load=_load_folder,
         cap_m=None,
-        obtain="your own: <pair>/left.png, right.png, calib.* and depth.npy, .pfm (metres) or .png (mm).",
+        obtain="your own pairs: <pair>/left.png, right.png, calib.* and depth.npy, .pfm (metres) "
+        "or .png (mm).",
+    ),
+    Dataset(
+        name="middlebury2021",
+        find=partial(_find_scenes, name="middlebury2021"),
+        load=_load_scene,
+        cap_m=None,
+        bad_px=2.0,
+        obtain="scene folders from https://vision.middlebury.edu/stereo/data/scenes2021/ "
+        "(free with citation).",
     ),
 ]

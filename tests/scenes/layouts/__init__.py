@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._internal.checks import bad_value
 from tests.scenes.layouts.corridor import corridor
 from tests.scenes.layouts.plain import plain_room
+from tests.scenes.layouts.repeated import repeated_room
 from tests.scenes.layouts.room import room
 from tests.scenes.layouts.street import street
 from tests.scenes.layouts.tabletop import tabletop
@@ -25,6 +26,7 @@ LAYOUTS = {
     "corridor": corridor,
     "terrain": terrain,
     "plain": plain_room,
+    "repeated": repeated_room,
 }
 """Layout function of each kind: ``(rng, seed) -> Scene``."""
 

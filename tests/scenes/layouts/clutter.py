@@ -1,4 +1,4 @@
-"""Small things that lie and stand around: boxes, books, papers, cups, bottles, leaflets, cloth.
+"""Small objects: boxes, books, papers, cups, bottles, leaflets, cloth.
 
 Data flow: a place and a size -> primitives in a ``Builder``.
 """
@@ -15,7 +15,7 @@ __all__ = ["cloth", "leaflet", "magazine", "thing"]
 
 
 def thing(spot: Spot, lx: float, lz: float, bottom: float, size: float) -> None:
-    """One small thing of about a size, resting at a height."""
+    """One small object of about a size, at rest at a height."""
     rng = spot.rng
     place = spot.moved(lx, lz, rng.uniform(-np.pi, np.pi), bottom)
     weights = (0.27, 0.14, 0.2, 0.1, 0.05, 0.07, 0.07, 0.05, 0.05)

@@ -1,4 +1,4 @@
-"""Corridors: a long narrow room with doors, lamps and things along the walls.
+"""Corridors: a long narrow room with doors, lamps and objects along the walls.
 
 Data flow: draws -> ``Scene`` of kind "corridor".
 """
@@ -23,7 +23,7 @@ _DOOR = 0.92
 
 
 def _side(spot: Spot, length: float, height: float, door: Look) -> None:
-    """Doors, pictures and furniture along one wall (local -z faces the corridor)."""
+    """Doors, posters and furniture along one wall (local -z faces the corridor)."""
     rng = spot.rng
     frame = surface_look(rng, "plain", pick(rng, "white", "wood", "grey"))
     at = -length / 2 + rng.uniform(0.3, 1.5)

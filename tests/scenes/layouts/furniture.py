@@ -129,7 +129,7 @@ def shelf(spot: Spot, width: float, height: float, depth: float = 0.3) -> None:
 
 
 def cabinet(spot: Spot, width: float, height: float, depth: float) -> None:
-    """Closed cabinet, chest of drawers or fridge, with things on top if low."""
+    """Closed cabinet, chest of drawers or fridge, with objects on top if low."""
     rng = spot.rng
     pal = palette(rng, pick(rng, "wood", "white", "grey", "painted"))
     tile = (width / max(1, round(width / 0.9)), height)

@@ -13,7 +13,7 @@ from tests.scenes.layouts.palettes import palette, pick, surface_look
 __all__ = ["crossing", "drives", "parcels", "repairs"]
 
 _LIFT_M = 0.004
-"""Each patch lies so much above the one before, or rays could not tell them apart."""
+"""Each patch is higher than the one before by this much, so that rays can distinguish them."""
 
 
 def _soft(rng: np.random.Generator) -> Look:
@@ -27,7 +27,7 @@ def _hard(rng: np.random.Generator) -> Look:
 
 
 def parcels(b: Builder, s: int, edge: float, ground: float, count: int) -> None:
-    """Fields, lawns and yards beside a road that runs along z, on side ``s`` from ``edge`` outwards."""
+    """Fields, lawns and yards next to a road that runs along z, on side ``s`` from ``edge`` outwards."""
     rng = b.rng
     for k in range(count):
         half = (rng.uniform(1.5, 25), rng.uniform(2, 40))

@@ -1,4 +1,4 @@
-"""What indoor kinds share: floor, walls and ceiling, things on walls, lamps, ambient light.
+"""Common parts of indoor scenes: floor, walls and ceiling, objects on walls, lamps, ambient light.
 
 Data flow: draws -> primitives, lights and fields of a ``Scene``.
 """
@@ -67,7 +67,7 @@ def door_look(rng: np.random.Generator, width: float, height: float) -> Look:
 
 
 def wall_decor(spot: Spot, height: float, low: float) -> None:
-    """A picture, mirror, window or clock on a wall that faces local -z (spot at the wall), above ``low``."""
+    """A poster, mirror, window or clock on a wall that faces local -z (spot at the wall), above ``low``."""
     rng = spot.rng
     up = rng.uniform(max(low, 1.0), max(low + 0.1, height - 0.7))
     frame = surface_look(rng, "plain", pick(rng, "white", "wood", "dark"))

@@ -102,7 +102,7 @@ def building(
 
 
 def house(spot: Spot) -> None:
-    """Detached house with a gable and a chimney, perhaps a garage beside it; its front along local -z."""
+    """Detached house with a gable and a chimney, perhaps a garage next to it; its front along local -z."""
     rng = spot.rng
     w, d = rng.uniform(7, 12), rng.uniform(7, 10)
     h = 2.9 * int(rng.integers(1, 3)) + rng.uniform(0.2, 0.8)

@@ -98,7 +98,7 @@ _OBJECT_LAYERS = (
 
 
 def object_look(rng: np.random.Generator, size: float, special: float = 0.06) -> Look:
-    """What a small thing may be made of; ``special`` is the chance of mirror or glass each."""
+    """Materials of a small object; ``special`` is the chance of mirror or glass each."""
     layer = pick(rng, *_OBJECT_LAYERS)
     draw = rng.random()
     if draw < special:

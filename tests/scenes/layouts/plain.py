@@ -1,4 +1,4 @@
-"""Plain rooms: painted walls at all angles to the camera, uneven light, a door and few things.
+"""Plain rooms: painted walls at all angles to the camera, uneven light, a door and few objects.
 
 Data flow: draws -> ``Scene`` of kind "plain".
 """
@@ -83,7 +83,7 @@ def plain_room(rng: np.random.Generator, seed: int) -> Scene:
     at = (rng.uniform(-0.35, 0.35) * width, 0.12 - height, rng.uniform(0.3, 0.8) * depth)
     area_light(b, at, 0.2, warm * rng.uniform(1.0, 2.5))
     side = (pick(rng, -1, 1) * (width / 2 - 0.3), -1.4, rng.uniform(0.2, 0.6) * depth)
-    b.light(side, np.array([0.8, 0.9, 1.0]) * rng.uniform(0.3, 1.0))  # a window beside the camera
+    b.light(side, np.array([0.8, 0.9, 1.0]) * rng.uniform(0.3, 1.0))  # a window next to the camera
     x, z = rng.uniform(-0.3, 0.3) * width, rng.uniform(0.3, 0.5)
     yaw, pitch = rng.uniform(-0.6, 0.6), np.radians(rng.uniform(-4, 16))
     rest = indoor_rest(rng, "plain", seed, rng.uniform(62, 74), (0.07, 0.12))

@@ -108,7 +108,7 @@ def country_side(b: Builder, s: int, plan: Plan) -> None:
     for _ in range(int(rng.integers(0, 10))):
         bush(Spot(b, s * (plan.edge + rng.exponential(4) + 0.8), rng.uniform(2, 50)), rng.uniform(0.4, 2.0))
     _trees(b, s, plan.edge + 1.5, plan.edge + 25, 4, plan.end, int(rng.integers(0, 7)))
-    if rng.random() < 0.6:  # a bank or a wood beside the road
+    if rng.random() < 0.6:  # a bank or a wood next to the road
         away, long_ = plan.edge + rng.uniform(2.5, 20), rng.uniform(15, 60)
         tree_line(
             Spot(b, s * away, rng.uniform(5, 20) + long_ / 2, np.pi / 2),

@@ -88,7 +88,7 @@ def _along_wall(spot: Spot, length: float, height: float) -> None:
 
 
 def _near_table(eye: Spot) -> None:
-    """A table with things in front of the camera, and a chair at it."""
+    """A table with objects in front of the camera, and a chair at it."""
     rng = eye.rng
     w, d, h = rng.uniform(1.0, 2.2), rng.uniform(0.6, 1.0), rng.uniform(0.6, 0.78)
     layer = pick(rng, "wood", "wood", "plain", "marble", "planks")

@@ -1,4 +1,4 @@
-"""A place to put things: local coordinates with a heading, heights upwards from the ground.
+"""A place for objects: local coordinates with a heading, heights upwards from the ground.
 
 Data flow: local positions and sizes -> primitives in a ``Builder``.
 """

@@ -1,4 +1,4 @@
-"""Table tops: many touching and overlapping things seen from near, a wall behind.
+"""Table tops: many touching and overlapping objects at close range, a wall behind.
 
 Data flow: draws -> ``Scene`` of kind "tabletop".
 """
@@ -20,7 +20,7 @@ __all__ = ["tabletop"]
 
 
 def _still_life(spot: Spot, w: float, d: float) -> None:
-    """Things over ``w`` by ``d`` metres around the spot, whose ground is the surface they stand on."""
+    """Objects over ``w`` by ``d`` metres around the spot, on the surface of its ground."""
     rng = spot.rng
     b = spot.b
     size = rng.uniform(0.1, 0.3)
@@ -89,7 +89,7 @@ def tabletop(rng: np.random.Generator, seed: int) -> Scene:
 
 
 def _eye(centre: Spot, w: float, d: float, h: float, width: float, depth: float) -> np.ndarray:
-    """A camera near the surface that looks at its things."""
+    """A camera near the surface that looks at its objects."""
     rng = centre.rng
     far, azimuth = d / 2 + rng.uniform(0.35, 1.5), rng.normal(0, 0.35)
     rise = rng.uniform(0.15, 0.9) + (0.3 if h == 0 else 0.0)

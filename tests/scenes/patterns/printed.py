@@ -1,4 +1,4 @@
-"""Printed and made things: text, posters, books, screens, keyboards, cupboard fronts, doors, windows.
+"""Printed and manufactured objects: text, posters, books, screens, keyboards, cupboards, doors, windows.
 
 Data flow: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile.
 """
@@ -157,20 +157,20 @@ def window(rng: np.random.Generator) -> np.ndarray:
 
 
 def document(lines: int) -> Bake:
-    """A printed page of ``lines`` lines, perhaps with a picture."""
+    """A printed page of ``lines`` lines, perhaps with a figure."""
 
     def bake(rng):
         ink = print_lines(rng, lines, 0.1)
-        picture = (
+        image = (
             (np.abs(TILE_X - 0.5) < 0.3)
             & (np.abs(TILE_Y - rng.uniform(0.25, 0.75)) < 0.12)
             & (rng.random() < 0.6)
         )
         return pack(
-            np.where(picture, spectral(rng, 1.2, 1), 0.0),
-            np.where(picture, 0.6, 0),
+            np.where(image, spectral(rng, 1.2, 1), 0.0),
+            np.where(image, 0.6, 0),
             0.03,
-            np.where(picture, 1, 1 - ink),
+            np.where(image, 1, 1 - ink),
         )
 
     return bake

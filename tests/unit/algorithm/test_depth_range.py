@@ -13,7 +13,7 @@ from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import DepthRange, MetricMap, smooth_floor
-from geodiff_plugin.types import CameraView, PosedViews
+from tests.views import posed_of
 
 
 def drawn(*shape: int, seed: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
@@ -27,7 +27,7 @@ def known(depth_m: torch.Tensor, seed: int) -> Matches:
 
 
 def evidence_of(points: Matches | None) -> Evidence:
-    nothing = PosedViews(torch.zeros(3, 4, 4), (), torch.eye(3))
+    nothing = posed_of(torch.zeros(3, 4, 4), np.eye(3))
     return Evidence(nothing, nothing, None, None, points)
 
 
@@ -128,13 +128,14 @@ def test_one_number_is_the_depth_of_a_wall_in_front_of_each_camera():
     generator = torch.Generator().manual_seed(0)
     texture = torch.rand(2, 3, 12, 40, generator=generator)
     texture = torch.nn.functional.interpolate(texture, (24, 160), mode="bicubic").clamp(0, 1)
-    K = torch.tensor([[60.0, 0, 24], [0, 60.0, 12], [0, 0, 1]]).repeat(2, 1, 1)
-    T = torch.eye(4).repeat(2, 1, 1)
-    T[:, 0, 3] = torch.tensor([-0.5, -1.05])  # shifts of 10 px and 9 px
-    left = texture[..., 40:88]
-    right = torch.stack([texture[b, ..., 40 + shift : 88 + shift] for b, shift in enumerate((10, 9))])
+    K = [[60.0, 0, 24], [0, 60.0, 12], [0, 0, 1]]
+    views = []
+    for b, (shift, baseline) in enumerate(((10, 0.5), (9, 1.05))):
+        T = np.eye(4)
+        T[0, 3] = -baseline
+        views.append(posed_of(texture[b, ..., 40:88], K, (texture[b, ..., 40 + shift : 88 + shift], K, T)))
     config = DEFAULT.changed(g_s_range=(1.0, 12.0), g_s_candidates=12, weights={"photometric": 1.0})
-    objective = Objective(PosedViews(left, (CameraView(right, K, T),), K), MetricMap("depth"), config)
+    objective = Objective(views, MetricMap("depth"), config)
     x = torch.full((2, 1, 24, 48), 1.0 / np.log(2.0) - 1.0)  # log(2) (x + 1) = 1
     affine, on_edge = search_one_number(x.requires_grad_(), objective)
     assert affine.g_s.tolist() == [3.0, 7.0] and on_edge.tolist() == [False, False]

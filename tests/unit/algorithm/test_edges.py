@@ -32,9 +32,9 @@ def reference(depth_m: np.ndarray, image: np.ndarray, s: int) -> tuple[np.ndarra
         for dv, du in ((0, 1), (1, 0), (1, 1), (1, -1)):
             line = [at(inverse, v + k * s * dv, u + k * s * du) for k in range(-4, 5)]
             ahead, behind = line[5] - line[4], line[4] - line[3]
-            stepped = min(abs(ahead), abs(behind)) > 0.02 * line[4]
+            discontinuity = min(abs(ahead), abs(behind)) > 0.02 * line[4]
             beside = max(abs(line[8] - line[6]), abs(line[2] - line[0]))
-            ramps[v, u] |= ahead * behind > 0 and stepped and abs(line[5] - line[3]) > 2.0 * beside
+            ramps[v, u] |= ahead * behind > 0 and discontinuity and abs(line[5] - line[3]) > 2.0 * beside
         if not ramps[v, u]:
             continue
         window = []
@@ -59,9 +59,9 @@ def scene(height: int, width: int, seed: int, s: int) -> tuple[np.ndarray, np.nd
     for k in range(3):
         angle, at = rng.uniform(0, np.pi), rng.uniform(0.3, 0.7, 2) * (height, width)
         away = (np.cos(angle) * (u - at[1]) + np.sin(angle) * (v - at[0])) / s
-        share = 1 / (1 + np.exp(-(1.5 + k) * away))
-        inverse = inverse + rng.uniform(0.2, 0.6) * share
-        image += 0.15 * rng.normal() * (share > 0.5)
+        fraction = 1 / (1 + np.exp(-(1.5 + k) * away))
+        inverse = inverse + rng.uniform(0.2, 0.6) * fraction
+        image += 0.15 * rng.normal() * (fraction > 0.5)
     return (1.0 / inverse).astype(np.float32), image.clip(0, 1).astype(np.float32)
 
 
@@ -69,7 +69,7 @@ def scene(height: int, width: int, seed: int, s: int) -> tuple[np.ndarray, np.nd
 def test_ramps_get_the_weighted_median_of_their_window(monkeypatch, size, s, strip):
     """Two different maps at once, also in strips of six rows, at the border of the map and within it."""
     if strip is not None:
-        monkeypatch.setattr("geodiff_plugin._strips.STRIP_PIXELS", strip)
+        monkeypatch.setattr("geodiff_plugin._internal.strips.STRIP_PIXELS", strip)
         monkeypatch.setattr(edges, "STRIP", 5)
     pairs = [scene(*size, seed, s) for seed in (1, 5)]
     depth_m, image = (torch.from_numpy(np.stack(each)) for each in zip(*pairs, strict=True))

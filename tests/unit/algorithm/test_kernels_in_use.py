@@ -1,13 +1,11 @@
 """Stages by their kernels, in Triton's interpreter, against the same stages without them."""
 
-import sys
-from types import SimpleNamespace
-
 import torch
 
-from geodiff_plugin.algorithm import correction, solver
+from geodiff_plugin.algorithm import match_fitting, solver
 from geodiff_plugin.algorithm.edges import sharpen_edges
-from geodiff_plugin.algorithm.solver import FieldSystem, RobustField, RobustSystem, solve_field, solve_robust
+from geodiff_plugin.algorithm.solver import solve_field, solve_robust
+from geodiff_plugin.algorithm.systems import FieldSystem, RobustSystem
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import Matches
 from tests.unit.runtime.triton_interpreter import interpreted
@@ -26,18 +24,17 @@ def test_stages_of_the_fit_are_the_same_by_kernels():
     error = torch.tensor([0.04, 0.2]).view(2, 1, 1, 1)
 
     def stages():
-        residuals = correction._residuals(log_depth, matches, 0.03)
-        observed = correction._Observations(*residuals, matches.confidence, (log_depth, log_depth))
+        residuals = match_fitting._residuals(log_depth, matches, 0.03)
         return [
             *residuals,
-            *correction.edge_links(image, log_depth),
-            correction.off_edges(matches, depth_m, error).confidence,
-            correction._spread(residuals.residual, observed),
-            *correction._levels(error, DEFAULT),
+            *match_fitting.edge_affinities(image, log_depth),
+            match_fitting.off_edges(matches, depth_m, error).confidence,
+            match_fitting._spread(*residuals, matches.confidence),
+            *match_fitting._levels(error, DEFAULT),
         ]
 
     expected = stages()
-    with interpreted("geodiff_plugin.algorithm.correction_kernels") as kernels:
+    with interpreted("geodiff_plugin.algorithm.kernels.match_fitting") as kernels:
         kernels.CHUNK = 64  # there are 35 matches
         found = stages()
     for by_kernel, reference in zip(found, expected, strict=True):
@@ -49,35 +46,25 @@ def test_edges_are_sharpened_the_same_by_the_kernel():
     depth_m[..., 4], depth_m[..., 5:] = 3.1, 5.0
     image = drawn(1, 3, 6, 9, seed=1)
     expected = sharpen_edges(depth_m, image, 1)
-    with interpreted("geodiff_plugin.algorithm.edge_kernels"):
+    with interpreted("geodiff_plugin.algorithm.kernels.edges"):
         torch.testing.assert_close(sharpen_edges(depth_m, image, 1), expected)
     assert not torch.equal(expected, depth_m)
 
 
-def test_the_solver_uses_its_kernel_for_fields_that_it_can_index(monkeypatch):
+def test_the_solver_uses_its_kernel_for_fields_that_it_can_index(asked_kernels, monkeypatch):
     """The kernel itself is compared elsewhere: the interpreter is slow."""
-    asked = []
     fields = drawn(2, 2, *SIZE, seed=1)
-    found = RobustField(fields[:, :1], fields[:, 1:], None)
-    kernels = SimpleNamespace(
-        solve_field=lambda *arguments: asked.append(arguments) or fields,
-        solve_robust=lambda *arguments: asked.append(arguments) or found,
-    )
-    monkeypatch.setattr(solver, "use_kernel", lambda _: True)
-    monkeypatch.setitem(sys.modules, "geodiff_plugin.algorithm.kernels", kernels)
-    monkeypatch.setattr("geodiff_plugin.algorithm.kernels", kernels, raising=False)
     pixel = torch.ones(2, 1, *SIZE)
     system = FieldSystem(pixel, fields, pixel[..., 1:], pixel[..., 1:, :])
-    assert solve_field(system, 3, fields) is fields
-    links, number = (system.across, system.down), torch.ones(1, 2, 1, 1, 1)
-    robust = RobustSystem(pixel, pixel, pixel, None, 2.0, links, number, 0.1 * number)
-    assert solve_robust(robust, 2, 3, with_support=True) is found
-    assert asked == [(system, 3, fields), (robust, 2, 3, True)]
+    affinities, number = (system.across, system.down), torch.ones(1, 2, 1, 1, 1)
+    robust = RobustSystem(pixel, pixel, pixel, None, 2.0, affinities, number, 0.1 * number)
+    field, of_passes = (f"algorithm.kernels.solver.{name}" for name in ("solve_field", "solve_robust"))
+    assert solve_field(system, 3, fields) == field
     # It can index so many values: a field of two channels has 140, a fit 70, with its support 140.
-    monkeypatch.setattr(solver, "MOST_VALUES", 139)
-    assert solve_field(system, 3, fields) is not fields
-    assert solve_robust(robust, 2, 3, with_support=True) is not found
-    assert solve_robust(robust, 2, 3) is found
-    monkeypatch.setattr(solver, "MOST_VALUES", 140)
-    assert solve_field(system, 3, fields) is fields
-    assert solve_robust(robust, 2, 3, with_support=True) is found
+    monkeypatch.setattr(solver, "MAX_VALUES", 139)
+    assert solve_field(system, 3, fields) != field
+    assert solve_robust(robust, 2, 3, with_support=True) != of_passes
+    assert solve_robust(robust, 2, 3) == of_passes
+    monkeypatch.setattr(solver, "MAX_VALUES", 140)
+    assert solve_field(system, 3, fields) == field
+    assert solve_robust(robust, 2, 3, with_support=True) == of_passes

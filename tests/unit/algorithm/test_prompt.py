@@ -5,12 +5,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from geodiff_plugin.algorithm.correction import fit_depth, prior_error
+from geodiff_plugin.algorithm.match_fitting import fit_depth, prior_error
 from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.types import PosedViews
+from tests.views import posed_of
 
 #: Smaller than a prompt, and larger: of 300 pixels 256 remain.
 SIZES = {"small": (14, 26), "large": (7, 300)}
@@ -20,19 +20,19 @@ def drawn(*shape: int, seed: int) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def truth(size: tuple[int, int]) -> torch.Tensor:
+def ground_truth(size: tuple[int, int]) -> torch.Tensor:
     """A slanted wall from 2 m to 5 m, ``(1, H, W)``."""
     return (2.0 + 3.0 * torch.linspace(0, 1, size[1]) ** 2).expand(1, *size)
 
 
-def given(size, share: float, seed: int, factor: float = 1.0) -> Matches:
-    known = (drawn(1, *size, seed=seed) < share).float()
-    depth_m = factor * truth(size)
+def given(size, fraction: float, seed: int, factor: float = 1.0) -> Matches:
+    known = (drawn(1, *size, seed=seed) < fraction).float()
+    depth_m = factor * ground_truth(size)
     return Matches(known / depth_m, known, 0.01 / depth_m.median())
 
 
 def evidence(size, points: Matches | None, reliable: Matches | None) -> Evidence:
-    left = PosedViews(drawn(3, *size, seed=9), (), torch.eye(3))
+    left = posed_of(drawn(3, *size, seed=9), np.eye(3))
     return Evidence(left, left, None, reliable, points, reliable)
 
 
@@ -59,11 +59,11 @@ def test_a_prompt_is_a_flat_map_that_was_fitted_to_what_is_known(size, kind):
     target = Matches(inverse[None], weight[None], step[None])
     # torch's median is the lower one of the middle two.
     middle = np.sort(inverse[weight > 0])[(int((weight > 0).sum()) - 1) // 2]
-    flat, left = torch.full((1, 1, *size), float(1.0 / middle)), image.grid.left_01[None]
+    flat, left = torch.full((1, 1, *size), float(1.0 / middle)), image.grid.left.image_01[None]
     fitted = fit_depth(flat, target, left, prior_error(flat, target, left, DEFAULT), DEFAULT).depth_m
     expected = F.interpolate(fitted, found.shape[-2:], mode="bilinear", antialias=True)[0]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-    true_m = F.interpolate(truth(size)[None], found.shape[-2:], mode="bilinear")[0]
+    true_m = F.interpolate(ground_truth(size)[None], found.shape[-2:], mode="bilinear")[0]
     right = (found / true_m / (1.3 if kind == "matches" else 1.0)).log().abs().median()
     assert right < (0.05 if kind != "both" else 0.3)
 

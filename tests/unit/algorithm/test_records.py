@@ -7,7 +7,7 @@ import pytest
 from geodiff_plugin.algorithm.denoising import NoiseLevel
 from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.algorithm.schedule import Schedule
-from geodiff_plugin.algorithm.solver import FieldSystem, RobustSystem
+from geodiff_plugin.algorithm.systems import FieldSystem, RobustSystem
 from geodiff_plugin.runtime.codec import ProcessingGrid
 from geodiff_plugin.runtime.hooks import Layers
 
@@ -21,7 +21,7 @@ def test_a_record_cannot_be_changed_by_one_of_its_readers(record):
             setattr(object.__new__(record), field.name, None)
 
 
-def test_a_prediction_type_that_is_not_known_is_refused():
+def test_a_prediction_type_that_is_not_known_is_rejected():
     for known in ("epsilon", "sample", "v_prediction", "flow_prediction"):
         NoiseLevel(None, None, known)
     with pytest.raises(ValueError, match="prediction_type must be one of .*; got 'velocity'"):

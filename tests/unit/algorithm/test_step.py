@@ -8,9 +8,9 @@ import torch
 
 from geodiff_plugin.algorithm import step
 from geodiff_plugin.algorithm.schedule import Round
-from geodiff_plugin.algorithm.step import Correction, Update, corrected_step, gradient_step, guided_step
+from geodiff_plugin.algorithm.step import MatchFit, Update, gradient_step, guided_step, match_fit_step
 from geodiff_plugin.algorithm.terms import Loss
-from geodiff_plugin.scale.space import AffineState
+from geodiff_plugin.scale.affine import AffineState
 
 
 def drawn(*shape: int, seed: int) -> torch.Tensor:
@@ -43,7 +43,7 @@ class LinearEstimate:
         return ENCODED * x
 
 
-class Rule:
+class Optimizer:
     """Moves against the gradient by a rate, and notes what it was given."""
 
     def __init__(self, rate: float) -> None:
@@ -60,29 +60,35 @@ class State:
     Its loss is ``sum(SLOPE x) + |z0 - anchor|^2 / 2 + 3 s_hat + 5 t_hat^2``.
     """
 
-    def __init__(self, moves: bool = True, crisp: bool = False, corrects: bool = True) -> None:
-        self.config = SimpleNamespace(optimize_latents=moves, crisp=crisp)
+    def __init__(
+        self, updates_latents: bool = True, refine_edges: bool = False, fits_matches: bool = True
+    ) -> None:
+        self.config = SimpleNamespace(optimize_latents=updates_latents, refine_edges=refine_edges)
         self.affine = AffineState(
             torch.tensor([0.3, -1.0]), torch.tensor([2.0, 0.5]), torch.tensor([4.0, 9.0])
         )
-        self.latent_rule, self.scale_rule, self.shift_rule = Rule(0.1), Rule(0.2), Rule(0.4)
-        self.corrects = corrects
+        self.latent_optimizer, self.scale_optimizer, self.shift_optimizer = (
+            Optimizer(0.1),
+            Optimizer(0.2),
+            Optimizer(0.4),
+        )
+        self.fits_matches = fits_matches
         self.done: list[tuple] = []
 
     def prepare(self, x, z0):
         self.done.append(("prepare", x, z0))
 
-    def find_hidden(self, x):
-        self.done.append(("find_hidden", x))
+    def find_occluded(self, x):
+        self.done.append(("find_occluded", x))
 
-    def note(self, name, tensor):
+    def record(self, name, tensor):
         self.done.append((name, tensor))
 
     def report(self, loss):
         self.done.append(("report", loss))
 
-    def corrected(self, x):
-        return 2.0 * x + 1.0 if self.corrects else x
+    def fitted(self, x):
+        return 2.0 * x + 1.0 if self.fits_matches else x
 
     def loss(self, x, affine, z0, anchor):
         pulled = 3.0 * affine.s_hat + 5.0 * affine.t_hat**2
@@ -106,32 +112,32 @@ def test_an_update_moves_latent_scale_and_shift_down_their_own_gradients(is_firs
     torch.testing.assert_close(state.affine.t_hat, before.t_hat - 0.4 * 10.0 * before.t_hat)
     assert torch.equal(state.affine.g_s, before.g_s)
     torch.testing.assert_close(update.loss.total, state.loss(update.relative, before, z0, anchor).total)
-    ((gradient, reference),) = state.latent_rule.given
+    ((gradient, reference),) = state.latent_optimizer.given
     torch.testing.assert_close(gradient, to_z)
     assert reference is estimate.eps
-    assert [name for name, *_ in state.done] == ["prepare", "find_hidden"] * is_first + [
+    assert [name for name, *_ in state.done] == ["prepare", "find_occluded"] * is_first + [
         "the gradient in the latent"
     ]
     if is_first:
         ((x, its_z0),) = state.of("prepare")
         torch.testing.assert_close(x, update.relative)
         torch.testing.assert_close(its_z0, z0)
-        assert state.of("find_hidden")[0][0] is not None and not x.requires_grad
+        assert state.of("find_occluded")[0][0] is not None and not x.requires_grad
     results = update.latent, update.relative, state.affine.s_hat, state.affine.t_hat
     assert not any(result.requires_grad for result in results)
 
 
 def test_a_correction_keeps_no_graph():
     z0 = drawn(2, 3, 4, 5, seed=5).requires_grad_()
-    found = corrected_step(State(), LinearEstimate(), z0, False)
+    found = match_fit_step(State(), LinearEstimate(), z0, False)
     assert not found.latent.requires_grad and not found.relative.requires_grad
 
 
 def test_without_moves_only_scale_and_shift_are_updated():
-    state, estimate = State(moves=False), LinearEstimate()
+    state, estimate = State(updates_latents=False), LinearEstimate()
     before = state.affine
     update = gradient_step(state, estimate, estimate.latent, estimate.latent, True)
-    assert torch.equal(update.latent, estimate.latent) and not state.latent_rule.given
+    assert torch.equal(update.latent, estimate.latent) and not state.latent_optimizer.given
     torch.testing.assert_close(state.affine.s_hat, before.s_hat - 0.6)
     torch.testing.assert_close(state.affine.t_hat, before.t_hat * (1.0 - 4.0))
 
@@ -145,27 +151,31 @@ def test_what_the_loss_does_not_depend_on_stays():
     torch.testing.assert_close(state.affine.t_hat, before.t_hat - 0.8)
 
 
-@pytest.mark.parametrize(("is_result", "read", "crisp", "corrects"), list(product((True, False), repeat=4)))
-def test_a_correction_encodes_the_change_where_the_latent_is_read(is_result, read, crisp, corrects):
-    """The result of a crisp call is corrected later; a map that is the result needs no latent."""
-    state, estimate = State(crisp=crisp, corrects=corrects), LinearEstimate(read)
+@pytest.mark.parametrize(
+    ("is_result", "read", "refine_edges", "fits_matches"), list(product((True, False), repeat=4))
+)
+def test_a_correction_encodes_the_change_where_the_latent_is_read(
+    is_result, read, refine_edges, fits_matches
+):
+    """The result of a sharp call is corrected later; a map that is the result needs no latent."""
+    state, estimate = State(refine_edges=refine_edges, fits_matches=fits_matches), LinearEstimate(read)
     z0 = drawn(2, 3, 4, 5, seed=5)
     x = (CHANNELS * z0).sum(1, keepdim=True)
-    found = corrected_step(state, estimate, z0, is_result)
+    found = match_fit_step(state, estimate, z0, is_result)
     assert estimate.finals == [is_result]
     ((prepared, its_z0),) = state.of("prepare")
     assert torch.equal(prepared, x) and its_z0 is z0
     needless = is_result and not read
-    corrected = 2.0 * x + 1.0 if corrects else x
-    encodes = corrects and not needless
+    fitted = 2.0 * x + 1.0 if fits_matches else x
+    encodes = fits_matches and not needless
     assert len(estimate.encoded) == encodes
-    torch.testing.assert_close(found.latent, z0 + ENCODED * (corrected - x) if encodes else z0)
-    torch.testing.assert_close(found.relative, x if is_result and crisp else corrected)
-    assert bool(state.of("the corrected map")) == (not (needless and crisp))
-    assert bool(state.of("the encoded correction")) == encodes
+    torch.testing.assert_close(found.latent, z0 + ENCODED * (fitted - x) if encodes else z0)
+    torch.testing.assert_close(found.relative, x if is_result and refine_edges else fitted)
+    assert bool(state.of("the fitted map")) == (not (needless and refine_edges))
+    assert bool(state.of("the encoded match fit")) == encodes
     if encodes:
-        ((noted,),) = state.of("the encoded correction")
-        assert torch.equal(noted, found.latent)
+        ((captured_warnings,),) = state.of("the encoded match fit")
+        assert torch.equal(captured_warnings, found.latent)
 
 
 class Recorded:
@@ -178,14 +188,14 @@ class Recorded:
         def correct(state, estimate, z, is_result):
             self.calls.append(("correct", z, is_result))
             self.count += 1
-            return Correction(z + 100.0, torch.tensor(float(self.count)))
+            return MatchFit(z + 100.0, torch.tensor(float(self.count)))
 
         def update(state, estimate, z, anchor, is_first):
             self.calls.append(("update", z, anchor, is_first))
             self.count += 1
             return Update(z + 1.0, torch.tensor(float(self.count)), f"loss {self.count}")
 
-        monkeypatch.setattr(step, "corrected_step", correct)
+        monkeypatch.setattr(step, "match_fit_step", correct)
         monkeypatch.setattr(step, "gradient_step", update)
 
 
@@ -210,7 +220,7 @@ def test_rounds_follow_each_other(monkeypatch, is_last):
                 torch.testing.assert_close(got, value)
             else:
                 assert got == value
-    torch.testing.assert_close(found.move, torch.full_like(z, 204.0))
+    torch.testing.assert_close(found.offset, torch.full_like(z, 204.0))
     assert found.relative.item() == 6.0 and found.is_current
     assert state.of("report") == [("loss 1",), ("loss 4",), (None,)]
 
@@ -246,4 +256,4 @@ def test_the_map_of_a_last_correction_without_updates_is_current(monkeypatch, ro
         ((x, its_z0),) = state.of("prepare")
         torch.testing.assert_close(its_z0, z0)
         torch.testing.assert_close(x, (CHANNELS * z0).sum(1, keepdim=True))
-        assert found.move.abs().max() == 0 and torch.equal(found.relative, x)
+        assert found.offset.abs().max() == 0 and torch.equal(found.relative, x)

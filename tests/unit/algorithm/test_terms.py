@@ -10,12 +10,23 @@ import torch.nn.functional as F
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin.algorithm.terms import TERMS, Given, Objective, Term, match_exposure
+from geodiff_plugin.algorithm.terms import (
+    ANCHOR_FLOOR,
+    TERM_CAUCHY,
+    TERMS,
+    Compared,
+    Given,
+    Objective,
+    Term,
+    match_exposure,
+)
 from geodiff_plugin.algorithm.terms import photometric as photometric_loss
+from geodiff_plugin.cameras import PosedViews
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.scale.space import AffineState, MetricMap
-from geodiff_plugin.types import CameraView, PosedViews
+from geodiff_plugin.scale.affine import AffineState
+from geodiff_plugin.scale.space import MetricMap
+from tests.views import posed_of
 
 SIZE, SIZES = (101, 131), ((90, 140), (117, 122))  # of the left images, of the further ones
 MAP = (57, 70)
@@ -44,19 +55,24 @@ def pose(turn_deg: tuple[float, float, float], t: tuple[float, float, float]) ->
     return T
 
 
-def chunk() -> PosedViews:
+def chunk() -> list[PosedViews]:
     """Two samples with cameras turned about all axes, which see a part of the left image each."""
     poses = [
         [pose((2, -4, 3), (-0.3, 0.05, 0.1)), pose((-3, -9, 1), (-0.6, 0.2, -0.1))],
         [pose((-2, 6, 4), (0.4, -0.1, 0.05)), pose((5, 34, -8), (0.3, 0.1, 0.0))],
     ]
-    views = []
-    for v in range(2):
-        Ks = [camera(SIZES[v], by) for by in (1.05 + 0.1 * v, 0.93)]
-        Ts = np.stack([of_image[v] for of_image in poses])
-        views.append(CameraView(image(SIZES[v], 3 + v), torch.tensor(Ks), torch.from_numpy(Ts).float()))
-    K_left = torch.tensor([camera(SIZE, 1.0), camera(SIZE, 1.1)])
-    return PosedViews(image(SIZE, 2), tuple(views), K_left)
+    samples = []
+    for b in range(2):
+        rights = [
+            (image(SIZES[v], 3 + v)[b], camera(SIZES[v], (1.05 + 0.1 * v, 0.93)[b]), poses[b][v])
+            for v in range(2)
+        ]
+        samples.append(posed_of(image(SIZE, 2)[b], camera(SIZE, (1.0, 1.1)[b]), *rights))
+    return samples
+
+
+def without_rights(views: list[PosedViews]) -> list[PosedViews]:
+    return [posed._replace(rights=()) for posed in views]
 
 
 def warped(right: np.ndarray, depth_m: np.ndarray, K_left, K, T) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +135,9 @@ def photometric(left, rights, seens, config) -> float:
             pairs = [halved(*pair) for pair in pairs]
         errors = np.full((len(pairs), *pairs[0][2].shape), np.inf)
         for error, (a, b, mask) in zip(errors, pairs, strict=True):
-            unlike = config.eta * ((1 - ssim(a, b)) / 2).clip(0, 1) + (1 - config.eta) * np.abs(a - b)
+            unlike = config.ssim_weight * ((1 - ssim(a, b)) / 2).clip(0, 1) + (
+                1 - config.ssim_weight
+            ) * np.abs(a - b)
             error[mask > 0] = unlike.mean(0)[mask > 0]
         least = errors.min(0)
         levels.append(least[np.isfinite(least)].mean())
@@ -139,7 +157,7 @@ def halved(left, right, mask):
     return cells(left * mask) / total, cells(right * mask) / total, (seen > 0.5).astype(float)
 
 
-WEIGHTS = {"photometric": 0.7, "matches": 0.3, "points": 0.2, "prior_pull": 0.05, "anchor": 2.0}
+WEIGHTS = {"photometric": 0.7, "matches": 0.3, "points": 0.2, "affine_reg": 0.05, "anchor": 2.0}
 
 
 def target(seed: int, shape=(2, 1, *SIZE)) -> Matches:
@@ -155,22 +173,24 @@ def a_case():
     z0, anchor = drawn(2, 4, 12, 15, seed=21), drawn(2, 4, 12, 15, seed=22)
     matches = target(24)
     matches.confidence[:, :, 20:60, 30:80] = 1.0  # whole cells of the latent are matched
-    hidden = F.interpolate(drawn(4, 1, 10, 12, seed=23), SIZE).view(2, 2, 1, *SIZE) > 0.8
-    return metric, x, Given(affine, start, z0, anchor, matches, target(26), hidden)
+    occluded = F.interpolate(drawn(4, 1, 10, 12, seed=23), SIZE).view(2, 2, 1, *SIZE) > 0.8
+    return metric, x, Given(affine, start, z0, anchor, matches, target(26), occluded)
 
 
 @pytest.mark.parametrize(
-    "knobs",
+    "parameters",
     [
         {},
-        {"exposure": False, "pyramid_levels": 2, "eta": 0.4, "pull_to": "zero"},
-        {"points_loss": "l1l2", "pyramid_levels": 4, "z_test": False},
+        {"exposure": False, "pyramid_levels": 2, "ssim_weight": 0.4, "affine_reg_target": "zero"},
+        {"points_loss": "l1l2", "pyramid_levels": 4, "occlusion_mask": False},
     ],
 )
-def test_terms_and_total_of_every_sample_are_those_of_numpy(knobs):
-    config = replace(DEFAULT, weights=WEIGHTS, min_visible=0.2, **knobs)
+def test_terms_and_total_of_every_sample_are_those_of_numpy(parameters):
+    config = replace(DEFAULT, weights=WEIGHTS, min_visible=0.2, **parameters)
     metric, x, given = a_case()
-    given = given if config.z_test else given._replace(hidden=None)  # as a trajectory without the test
+    given = (
+        given if config.occlusion_mask else given._replace(occluded=None)
+    )  # as a trajectory without the test
     views = chunk()
     with torch.no_grad():
         loss = Objective(views, metric, config)(x, given)
@@ -182,15 +202,14 @@ def test_terms_and_total_of_every_sample_are_those_of_numpy(knobs):
         of_map = large[b, 0].double().numpy()
         floored = (of_map + np.sqrt(of_map**2 + 4e-6)) / 2
         depth_m = float(given.affine.g_s[b]) / (scale * floored + shift)
-        left, K_left = (each[b].double().numpy() for each in (views.left_01, views.K_left))
+        left, K_left = views[b].left.image_01.double().numpy(), views[b].left.camera.K
         seen_by = [
-            warped(*(each.double().numpy() for each in (v.image_01[b],)), depth_m, K_left,
-                   *(each[b].double().numpy() for each in (v.K, v.T_right_from_left)))
-            for v in views.views
-        ]  # fmt: skip
+            warped(v.image_01.double().numpy(), depth_m, K_left, v.camera.K, v.T_right_from_left)
+            for v in views[b].rights
+        ]
         in_view = np.any([seen for _, seen in seen_by], 0).mean()
-        hidden = np.zeros((2, *SIZE), bool) if given.hidden is None else given.hidden[b, :, 0].numpy()
-        compared = [seen & ~behind for (_, seen), behind in zip(seen_by, hidden, strict=True)]
+        occluded = np.zeros((2, *SIZE), bool) if given.occluded is None else given.occluded[b, :, 0].numpy()
+        compared = [seen & ~behind for (_, seen), behind in zip(seen_by, occluded, strict=True)]
         terms = {"photometric": photometric(left, [right for right, _ in seen_by], compared, config)}
         for name, of in (("matches", given.matches), ("points", given.points)):
             w, c = (each[b, 0].double().numpy() for each in (of.inverse_depth, of.confidence))
@@ -202,9 +221,9 @@ def test_terms_and_total_of_every_sample_are_those_of_numpy(knobs):
             else:
                 terms[name] = np.average(robust, weights=c)
         pulls = [getattr(given.affine, n)[b] - getattr(given.affine_start, n)[b] for n in ("s_hat", "t_hat")]
-        if config.pull_to == "zero":
+        if config.affine_reg_target == "zero":
             pulls = [given.affine.s_hat[b], given.affine.t_hat[b]]
-        terms["prior_pull"] = float(sum(pull**2 for pull in pulls))
+        terms["affine_reg"] = float(sum(pull**2 for pull in pulls))
         matched = F.interpolate(given.matches.confidence[b : b + 1], (12, 15), mode="area")[0, 0].numpy()
         square = ((given.z0 - given.anchor)[b].numpy() ** 2).mean(0)
         terms["anchor"] = (square * np.maximum(1 - matched, 0.05)).mean()
@@ -240,16 +259,16 @@ def test_a_term_counts_only_where_it_has_its_input_a_weight_and_enough_of_the_sc
         return set(Objective(views, metric, config)(x, given._replace(**changes)).terms)
 
     assert names() == set(WEIGHTS)
-    assert names(matches=None) == {"photometric", "points", "prior_pull", "anchor"}
-    assert names(points=None) == {"photometric", "matches", "prior_pull", "anchor"}
-    assert names(views=views._replace(views=()), hidden=None) == set(WEIGHTS) - {"photometric"}
+    assert names(matches=None) == {"photometric", "points", "affine_reg", "anchor"}
+    assert names(points=None) == {"photometric", "matches", "affine_reg", "anchor"}
+    assert names(views=without_rights(views), occluded=None) == set(WEIGHTS) - {"photometric"}
     assert names(weights=WEIGHTS | {"anchor": 0.0}) == set(WEIGHTS) - {"anchor"}
-    alone = Objective(views._replace(views=()), metric, DEFAULT)(x, given._replace(hidden=None))
+    alone = Objective(without_rights(views), metric, DEFAULT)(x, given._replace(occluded=None))
     assert alone.visible_fraction.tolist() == [0.0, 0.0]
     # Each sample on its own: of the second one more is seen.
-    shares = Objective(views, metric, DEFAULT)(x, given).visible_fraction
-    assert shares[0] < shares[1] - 0.01
-    for limit, counted in ((float(shares[0]), [True, True]), (float(shares[1]), [False, True])):
+    fractions = Objective(views, metric, DEFAULT)(x, given).visible_fraction
+    assert fractions[0] < fractions[1] - 0.01
+    for limit, counted in ((float(fractions[0]), [True, True]), (float(fractions[1]), [False, True])):
         config = replace(DEFAULT, weights={"photometric": 1.0}, min_visible=limit)
         loss = Objective(views, metric, config)(x, given)
         assert (loss.total > 0).tolist() == (loss.terms["photometric"] > 0).tolist() == counted
@@ -258,7 +277,7 @@ def test_a_term_counts_only_where_it_has_its_input_a_weight_and_enough_of_the_sc
 def test_gradients_go_to_the_latent_the_map_and_both_numbers_of_the_scale():
     """Of the anchor term by its formula; the network's own latent, where the anchor is, is no variable."""
     metric, x, given = a_case()
-    config = replace(DEFAULT, weights={"anchor": 3.0, "prior_pull": 0.5})
+    config = replace(DEFAULT, weights={"anchor": 3.0, "affine_reg": 0.5})
     leaves = [each.clone().requires_grad_() for each in (given.z0, given.affine.s_hat, given.affine.t_hat, x)]
     moved = replace(given.affine, s_hat=leaves[1], t_hat=leaves[2])
     given = given._replace(z0=leaves[0], affine=moved)
@@ -278,21 +297,25 @@ def test_gradients_go_to_the_latent_the_map_and_both_numbers_of_the_scale():
 def test_what_an_estimate_hides_is_found_for_every_view_and_sample():
     """A near square before a wall hides, from a camera to its right, a strip of the wall to its left."""
     views, metric = chunk(), MetricMap("depth")
-    K = views.K_left
-    right, left = (torch.eye(4).repeat(2, 1, 1) for _ in range(2))
-    right[:, 0, 3], left[:, 0, 3] = -0.5, torch.tensor([0.5, 0.25])
-    further = tuple(CameraView(views.left_01, K, T) for T in (right, left))
+    shifts = ((-0.5, 0.5), (-0.5, 0.25))
+    for b, of_sample in enumerate(shifts):
+        rights = []
+        for shift in of_sample:
+            T = np.eye(4, dtype=np.float32)
+            T[0, 3] = shift
+            rights.append(views[b].left._replace(T_right_from_left=T))
+        views[b] = views[b]._replace(rights=tuple(rights))
     x = torch.ones(2, 1, *SIZE)
     x[:, :, 30:70, 50:80] = 0.0
     affine = metric.from_range(torch.tensor([2.0, 2.0]), torch.tensor([8.0, 8.0]))
-    hidden = Objective(views._replace(views=further), metric, DEFAULT).hidden(x, affine)
-    assert hidden.shape == (2, 2, 1, *SIZE) and hidden.dtype == torch.bool
+    occluded = Objective(views, metric, DEFAULT).occluded(x, affine)
+    assert occluded.shape == (2, 2, 1, *SIZE) and occluded.dtype == torch.bool
     for b, v in np.ndindex(2, 2):
-        shift = abs(float(further[v].T_right_from_left[b, 0, 3])) * float(K[b, 0, 0]) * (1 / 2 - 1 / 8)
-        rows = hidden[b, v, 0, 35:65]
+        shift = abs(shifts[b][v]) * float(views[b].left.camera.K[0, 0]) * (1 / 2 - 1 / 8)
+        rows = occluded[b, v, 0, 35:65]
         strip = rows[:, :50] if v == 0 else rows[:, 80:]
         assert strip.sum(1).float().mean().item() == pytest.approx(shift, abs=1.5)
-        assert hidden[b, v].sum() < 60 * (shift + 2)
+        assert occluded[b, v].sum() < 60 * (shift + 2)
 
 
 @pytest.mark.parametrize("factor", [0.05, 0.5, 8.0])
@@ -315,9 +338,7 @@ def test_an_error_at_points_within_rounding_pulls_no_more():
     for off, pulls in ((0.9e-3, False), (1.2e-3, True)):
         points = Matches(0.5 + off * step * torch.tensor([1.0, -1.0, 0.0]).view(1, 1, 1, 3),
                          torch.ones(1, 1, 1, 3), step)  # fmt: skip
-        objective = Objective(
-            PosedViews(torch.zeros(1, 3, 1, 3), (), torch.eye(3)[None]), MetricMap(), DEFAULT
-        )
+        objective = Objective([posed_of(torch.zeros(3, 1, 3), np.eye(3))], MetricMap(), DEFAULT)
         affine = AffineState(*torch.zeros(3, 1))
         compared = Given(affine, affine, torch.zeros(1, 1), torch.zeros(1, 1), None, points)
         value = _points_alone(objective, depth_m, compared)
@@ -336,3 +357,71 @@ def test_a_term_of_ones_own_joins_the_sum(monkeypatch):
     config = replace(DEFAULT, weights={"nearer": 3.0})
     loss = Objective(chunk(), metric, config)(x, given)
     torch.testing.assert_close(loss.total, 3.0 * loss.terms["nearer"])
+
+
+SIZE_TERMS = (32, 40)
+FLAT = DEFAULT.changed(pyramid_levels=1)
+photometric_of_terms = TERMS["photometric"].function
+
+
+def draw(*shape, seed=0):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def estimate(**changes):
+    left = draw(2, 3, *SIZE_TERMS)
+    affine = AffineState(torch.tensor([0.3, -2.0]), torch.tensor([1.0, 0.5]), torch.tensor([2.0, 9.0]))
+    half = torch.full((2, 1, *SIZE_TERMS), 0.5, dtype=torch.float64)
+    matches = Matches(half, torch.ones_like(half), torch.tensor([0.01, 0.02]))
+    latent = torch.zeros(2, 4, 8, 10, dtype=torch.float64)
+    seen = torch.ones(2, 1, 1, *SIZE_TERMS, dtype=torch.bool)
+    values = (1.0 / half, left, left[:, None].clone(), seen, affine, affine, latent, latent, matches, matches)
+    return Compared(*values)._replace(**changes)
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_a_perfect_estimate_costs_nothing(name):
+    value = TERMS[name].function(estimate())
+    torch.testing.assert_close(value.double(), torch.zeros(2).double(), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("parameters", [{}, {"points_loss": "l1l2", "affine_reg_target": "zero"}])
+@pytest.mark.parametrize("matched", [True, False])
+def test_values_are_the_formulas(parameters, matched):
+    depth, inverse, confidence = (
+        1 + draw(2, 1, *SIZE_TERMS),
+        draw(2, 1, *SIZE_TERMS, seed=1),
+        draw(2, 1, *SIZE_TERMS, seed=2),
+    )
+    confidence[1] = 0.0  # the second sample has no match at all
+    z0, unit = draw(2, 4, 8, 10, seed=3), torch.tensor([0.01, 0.3], dtype=torch.float64)
+    target, start = Matches(inverse, confidence, unit), AffineState(*draw(3, 2, seed=4))
+    compared = estimate(depth_m=depth, matches=target if matched else None, points=target, z0=z0)
+    compared = compared._replace(affine_start=start, config=DEFAULT.changed(**parameters))
+    d, w, c = (x.numpy() for x in (depth, inverse, confidence))
+    e = (1 / d - w) / unit.numpy()[:, None, None, None]
+    robust = TERM_CAUCHY**2 / 2 * np.log1p((e / TERM_CAUCHY) ** 2)
+    metres, known = np.abs(d - 1 / w), c > 0
+
+    def mean(x, weight):
+        return (x * weight).sum((1, 2, 3)) / np.maximum(weight.sum((1, 2, 3)), 1e-6)
+
+    points = mean(metres + metres**2, known) if parameters else mean(robust, c)
+    s, t = compared.affine.s_hat.numpy(), compared.affine.t_hat.numpy()
+    s, t = (s, t) if parameters else (s - start.s_hat.numpy(), t - start.t_hat.numpy())
+    fraction = F.interpolate(confidence, (8, 10), mode="area").numpy()
+    square = (z0.numpy() ** 2).mean(1, keepdims=True) * (
+        np.maximum(1 - fraction, ANCHOR_FLOOR) if matched else 1
+    )
+    expected = {"points": points, "affine_reg": s**2 + t**2, "anchor": square.mean((1, 2, 3))}
+    for name, value in (expected | ({"matches": mean(robust, c)} if matched else {})).items():
+        np.testing.assert_allclose(TERMS[name].function(compared), value, rtol=1e-6, err_msg=name)
+
+
+def test_photometric_ignores_what_is_not_visible():
+    warped, seen = estimate().warped_01.clone(), torch.zeros(2, 1, 1, *SIZE_TERMS, dtype=torch.bool)
+    warped[..., 20:] = 0.0
+    seen[..., :18] = True  # SSIM looks one pixel around
+    masked = photometric_of_terms(estimate(warped_01=warped, visible=seen, config=FLAT))
+    torch.testing.assert_close(masked, torch.zeros_like(masked), atol=1e-5, rtol=0)
+    assert (photometric_of_terms(estimate(warped_01=warped, config=FLAT)) > 0.1).all()

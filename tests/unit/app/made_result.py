@@ -3,10 +3,10 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._reprojection import PosedCamera
 from geodiff_plugin.app.shown import Figure, Shown
-from geodiff_plugin.messages import Message
-from geodiff_plugin.result.standing import Standing, Tone
+from geodiff_plugin.cameras import PosedCamera
+from geodiff_plugin.findings import Finding
+from geodiff_plugin.trust import Tone, TrustSummary
 
 H, W = 30, 44
 K = np.array([[50.0, 0, 20.5], [0, 46.0, 13.25], [0, 0, 1]])
@@ -24,18 +24,19 @@ def made_result(**changes) -> Shown:
     """Smooth depth, and confidence and spread that differ from pixel to pixel."""
     v, u = np.mgrid[:H, :W]
     depth_m = (2.0 + 0.02 * u + 0.01 * v).astype(np.float32)
-    photograph = np.stack([5 * u, 8 * v, 100 + u + v], axis=-1).astype(np.uint8)
-    assumed = Message("camera.same-centre", "The right camera's cx is assumed.")
-    told = Message("image.dark", "LEFT is nearly black.")
+    image = np.stack([5 * u, 8 * v, 100 + u + v], axis=-1).astype(np.uint8)
+    assumed = Finding("camera.assumed-cx", "The right camera's cx is assumed.")
+    reported = Finding("image.dark", "LEFT is nearly black.")
     entries = {
-        "photograph": photograph,
+        "name": "a pair",
+        "image": image,
         "depth_m": depth_m,
-        "views": (PosedCamera(K, np.eye(4), (W, H)), PosedCamera(RIGHT_K, pose(), (52, 36))),
-        "standing": Standing("trusted", Tone.CAUTION, "trusted if what is assumed holds", (assumed,)),
-        "messages": (told,),
+        "views": (PosedCamera(K, (W, H), E=np.eye(4)), PosedCamera(RIGHT_K, (52, 36), E=pose())),
+        "trust": TrustSummary("trusted", Tone.CAUTION, "trusted, given the assumptions", (assumed,)),
+        "messages": (reported,),
         "figures": (Figure("2.00 m", "median depth"), Figure("1.5 s", "computing")),
         "cameras": "Left camera: <fx 50>.",
         "confidence": (0.2 + 0.7 * u / W + 0.05 * v / H).astype(np.float32),
-        "uncertainty_m": (0.01 + 0.001 * v + 0.0005 * u).astype(np.float32),
+        "sigma_m": (0.01 + 0.001 * v + 0.0005 * u).astype(np.float32),
     }
     return Shown(**(entries | changes))

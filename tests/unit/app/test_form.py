@@ -1,4 +1,4 @@
-"""The fields of the page: what they are called, hold and show, and the options that they become."""
+"""The fields of the page: what they are called, hold and show, and the requests that they become."""
 
 import asyncio
 import gc
@@ -9,9 +9,10 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors
-from geodiff_plugin.options import PRESETS, help_of
+from geodiff_plugin.app.job import CAMERA_INPUTS, LIMITS, Priors
+from geodiff_plugin.app.messages import PageError
+from geodiff_plugin.options import PRESETS, RunOptions
+from geodiff_plugin.settings import settings_of
 
 gr = pytest.importorskip("gradio", reason="gradio is in the extra app")
 pytestmark = [
@@ -60,10 +61,14 @@ NUMBERS = {
 }
 
 
+def options_of(drawn, values: dict):
+    return drawn.form.request(tuple(values.values())).options
+
+
 def test_untouched_fields_are_the_defaults_of_the_command(drawn, pair):
     from geodiff_plugin.jobs.options import DepthOptions
 
-    options = drawn.form.options(tuple((drawn.form.untouched | pair).values()))
+    options = options_of(drawn, drawn.form.initial | pair)
     usual = DepthOptions(left=Path(pair["left"]), right=Path(pair["right"]), prior="tiny")
     own = {"calib": (Path(pair["calib"][0]),), "export": ("glb", "mesh")}
     assert vars(options) == vars(usual) | own
@@ -78,41 +83,61 @@ def test_every_field_becomes_its_own_option(drawn, pair):
         "resolution": 416,
         "seed": 11.0,
     }
-    filled = drawn.form.untouched | pair | NUMBERS | settings
-    options = drawn.form.options(tuple((filled | {"way": "numbers"}).values()))
+    filled = drawn.form.initial | pair | NUMBERS | settings
+    options = options_of(drawn, filled | {"camera_input": "numbers"})
     assert (options.fx, options.fy, options.cx, options.cy) == (61.5, 62, 30.5, 21)
     assert (options.cx_right, options.baseline, options.near, options.far) == (33, 0.125, 0.5, 9)
     got = {name: getattr(options, name) for name in settings}
     assert got == settings and isinstance(options.seed, int) and options.calib == ()
     assert (str(options.left), str(options.right)) == (pair["left"], pair["right"])
-    length = {"way": "photographs", "known_length": "2,5", "ends": "1, 2, 3, 4", "baseline": ""}
-    options = drawn.form.options(tuple((filled | length).values()))
+    known = {"scale_input": "known", "known_length": "250 cm", "ends": "1, 2, 3, 4"}
+    options = options_of(drawn, filled | {"camera_input": "images"} | known)
     assert options.known_length == "1,2,3,4,2.5" and options.estimate_pose and options.baseline is None
-    none = filled | {"way": "file", "calib": None, "steps": None, "seed": None}
-    with pytest.raises(InputError, match="The calibration file is missing"):
-        drawn.form.options(tuple(none.values()))
-    for name, label in (
-        ("far", "Farthest depth, m"),
-        ("known_length", "Or a known length"),
-        ("cx_right", "Right camera's cx, px"),
+    none = filled | {"camera_input": "file", "calib": None, "steps": None, "seed": None}
+    with pytest.raises(PageError, match="The calibration file is missing"):
+        options_of(drawn, none)
+    for name, message in (
+        ("far", "Farthest depth, m: enter a number such as 0.12 or 12 cm, not 'x'. Clear the field"),
+        ("known_length", "Known length, m: enter a number such as 0.12 or 12 cm, not 'x'."),
+        ("cx_right", "Right camera's cx, px: enter a number such as 812.5, not 'x'."),
     ):
-        with pytest.raises(InputError, match=f"{label}.* must be a number; got 'x'. Leave it empty"):
-            drawn.form.options(tuple((filled | {name: "x"}).values()))
+        with pytest.raises(PageError, match=message):
+            options_of(drawn, filled | {name: "x"})
+
+
+@pytest.mark.parametrize(
+    ("text", "metres"),
+    [("0.12", 0.12), ("12 cm", 0.12), ("120mm", 0.12), (" 1,5 m ", 1.5), ("2", 2.0), ("1e-1", 0.1)],
+)
+def test_lengths_have_any_metric_unit(text, metres):
+    from geodiff_plugin.app.form import _number
+
+    assert _number(text, "baseline") == pytest.approx(metres)
+
+
+@pytest.mark.parametrize("text", ["12 px", "x", "1.2.3", "12 inch", "nan", "1 2", "--1", "12 cm"])
+def test_what_is_no_number_of_pixels_is_explained(text):
+    from geodiff_plugin.app.form import _number
+
+    with pytest.raises(PageError, match="fx, px: enter a number such as 812.5, not"):
+        _number(text, "fx")
+    assert _number("  ", "fx") is None
 
 
 @pytest.mark.parametrize("number", range(5))
 def test_an_example_fills_in_its_files_and_nothing_else(number, drawn):
-    from geodiff_plugin.app.form import EXAMPLES
+    from geodiff_plugin.app.job import EXAMPLES
 
     example = EXAMPLES[number]
     values = dict(zip(drawn.form.fields, drawn.form.example(number), strict=True))
-    changed = {name: value for name, value in values.items() if value != drawn.form.untouched[name]}
+    changed = {name: value for name, value in values.items() if value != drawn.form.initial[name]}
     folder = example.folder
     assert changed == {
         "left": str(example.left),
         "right": str(folder / f"right.{example.ending}"),
         "calib": [str(folder / "calib.txt")],
     }
+    assert values["camera_input"] == "file"
     assert all(Path(path).is_file() for path in (changed["left"], changed["right"], *changed["calib"]))
     captions = (
         [image.caption for image in drawn.gallery.value.root]
@@ -121,15 +146,16 @@ def test_an_example_fills_in_its_files_and_nothing_else(number, drawn):
     )
     labels = captions or [entry["caption"] for entry in drawn.gallery.value]
     assert labels[number] == example.label and len(labels) == len(EXAMPLES)
+    assert drawn.form.request(tuple(values.values())).name == example.label
 
 
 def test_fields_are_named_limited_and_begin_as_they_should(drawn):
     fields = drawn.form.fields
     labels = {name: field.label for name, field in fields.items()}
-    assert labels["left"] == "Left photograph" and labels["right"] == "Right photograph"
-    assert labels["known_length"] == "Or a known length in the left photograph, m"
+    assert labels["left"] == "Left image" and labels["right"] == "Right image"
     assert all(label for label in labels.values()) and len(set(labels.values())) == len(labels)
-    assert fields["way"].choices == [(label, name) for name, label in CAMERA_WAYS.items()]
+    assert fields["camera_input"].choices == [(label, name) for name, label in CAMERA_INPUTS.items()]
+    assert next(iter(CAMERA_INPUTS)) == "images" and fields["camera_input"].value == "file"
     assert (
         fields["prior"].choices == [("tiny", "tiny"), ("other", "other")] and fields["prior"].value == "tiny"
     )
@@ -140,7 +166,7 @@ def test_fields_are_named_limited_and_begin_as_they_should(drawn):
         slider = fields[name]
         assert (slider.minimum, slider.maximum, slider.value, slider.step) == (least, LIMITS[name], least, 1)
     for name in ("steps", "ensemble", "preset"):
-        assert fields[name].info == help_of(name)
+        assert fields[name].info == settings_of(RunOptions)[name].help
     resolution = fields["resolution"]
     assert (resolution.minimum, resolution.value, resolution.step) == (
         0,
@@ -150,13 +176,14 @@ def test_fields_are_named_limited_and_begin_as_they_should(drawn):
     assert (fields["seed"].value, fields["seed"].minimum, fields["seed"].precision) == (0, 0, 0)
     assert fields["calib"].file_count == "multiple" and fields["left"].type == "filepath"
     assert fields["left"].sources == ["upload", "clipboard"]
-    one_line = ("fx", "fy", "cx", "cy", "cx_right", "baseline", "known_length", "ends", "near", "far")
+    one_line = "fx fy cx cy cx_right fov baseline baseline_error known_length ends near far".split()
     assert all(fields[name].max_lines == 1 and fields[name].elem_id == name for name in one_line)
     assert all(fields[name].placeholder for name in one_line)
-    ids = {name: fields[name].elem_id for name in ("left", "right", "way", "calib")}
-    assert ids == {"left": "left", "right": "right", "way": "way", "calib": "calibration"}
+    ids = {name: fields[name].elem_id for name in ("left", "right", "camera_input", "calib")}
+    assert ids == {"left": "left", "right": "right", "camera_input": "camera-input", "calib": "calibration"}
     assert (drawn.form.run.elem_id, drawn.form.stop.elem_id) == ("run", "stop")
     assert (drawn.form.run.value, drawn.form.stop.value) == ("Estimate depth", "Stop")
+    assert drawn.form.stop.interactive is False, "nothing is running"
     assert drawn.form.run.variant == "primary" and drawn.gallery.elem_id == "examples"
     gallery = drawn.gallery
     assert (
@@ -181,77 +208,82 @@ def shown_fields(drawn) -> dict[str, bool]:
 def test_at_first_the_fields_of_a_calibration_file_are_seen(drawn):
     seen = shown_fields(drawn)
     hidden = {name for name, is_seen in seen.items() if not is_seen}
-    assert hidden == {"fx", "fy", "cx", "cy", "cx_right", "known_length", "ends"}
+    of_images = {"camera", "fov", "scale_input", "baseline_error", "guess", "known_length", "ends"}
+    assert hidden == {"fx", "fy", "cx", "cy", "cx_right", *of_images}
+    assert drawn.form.fields["baseline"].placeholder == "from the file"
 
 
 @pytest.mark.parametrize(
-    ("way", "seen"),
+    ("given", "seen"),
     [
-        ("file", {"calib", "formats"}),
-        ("numbers", {"lens", "cx_right"}),
-        ("photographs", {"lens", "length"}),
+        (("file", "exif", "measured"), {"calib", "formats", "baseline"}),
+        (("numbers", "fov", "known"), {"lens", "cx_right", "baseline"}),
+        (("images", "exif", "measured"), {"camera", "scale", "baseline", "error"}),
+        (("images", "fov", "guess"), {"camera", "fov", "scale", "guess"}),
+        (("images", "fx", "known"), {"camera", "lens", "scale", "length"}),
     ],
 )
-def test_a_way_shows_the_fields_that_it_needs(way, seen, drawn):
-    fields = drawn.form.fields
-    (handler,) = handlers(drawn, fields["way"], "change")
-    named = {fields["calib"]._id: "calib", fields["cx_right"]._id: "cx_right"}
-    named |= {
-        fields["fx"].parent.parent.parent._id: "lens",
-        fields["known_length"].parent.parent._id: "length",
-    }
-    outputs = [named.get(output._id, "formats") for output in handler.outputs]
-    assert (
-        len(set(outputs)) == 5
-        and not handler.queue
-        and [i._id for i in handler.inputs] == [fields["way"]._id]
-    )
-    updates = dict(zip(outputs, handler.fn(way), strict=True))
+def test_a_source_shows_the_fields_that_it_needs_with_fitting_placeholders(given, seen, drawn, monkeypatch):
+    fields = [drawn.form.fields[name] for name in ("camera_input", "camera", "scale_input")]
+    handler = next(f for f in handlers(drawn, fields[2], "change") if len(f.outputs) > 1)
+    assert not handler.queue and [i._id for i in handler.inputs] == [field._id for field in fields]
+    assert {(field._id, "change") for field in fields} == set(handler.targets)
+    groups = handler.fn.args[0]
+    updates = dict(zip(groups, handler.fn(*given), strict=True))
     assert {name for name, update in updates.items() if update["visible"]} == seen
+    placeholders = {"file": "from the file", "numbers": "required", "images": "such as 12 cm"}
+    assert updates["baseline"]["placeholder"] == placeholders[given[0]]
+    monkeypatch.setattr("geodiff_plugin.app.form.can_estimate", lambda: False)
+    updates = dict(zip(groups, handler.fn(*given), strict=True))
+    assert updates["poselib"]["visible"] == (given[0] == "images"), "a missing package is reported at once"
 
 
-def test_a_dropped_file_is_told_by_its_size_or_by_what_is_wrong(drawn, pair, tmp_path, monkeypatch):
+def test_a_dropped_file_is_described_by_its_size_or_its_error(drawn, pair, tmp_path, monkeypatch):
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.new("RGB", (64, 48)).save(tmp_path / "turned.jpg", exif=exif)
     for side in ("left", "right"):
-        (handler,) = [f for f in handlers(drawn, drawn.form.fields[side], "change") if f.inputs]
-        assert [output.elem_id for output in handler.outputs] == [f"{side}-note"]
-        assert handler.fn(None) == ""
-        assert handler.fn(pair["left"]) == '<div class="note">64 x 48 pixels</div>'
-        assert handler.fn(str(tmp_path / "turned.jpg")) == '<div class="note">48 x 64 pixels</div>'
-        said = handler.fn(__file__)
-        assert said.startswith(
-            f'<div class="note bad" role="alert">the {side} photograph must be an image file'
+        of_field = handlers(drawn, drawn.form.fields[side], "change")
+        (handler,) = [f for f in of_field if [each.elem_id for each in f.outputs] == [f"{side}-note"]]
+        given = ("file", "exif")
+        size = '<div class="note">64 x 48 pixels</div>'
+        assert handler.fn(None, *given) == "" and handler.fn(pair["left"], *given) == size
+        assert handler.fn(str(tmp_path / "turned.jpg"), *given) == '<div class="note">48 x 64 pixels</div>'
+        message = handler.fn(__file__, *given)
+        assert message.startswith(
+            '<div class="note error" role="alert">An image file cannot be read. Save it'
         )
-        assert str(Path(__file__).parent) not in said
-    monkeypatch.setattr("geodiff_plugin.app.form.photograph_size", lambda path, name: (64, 40))
+        assert str(Path(__file__).parent) not in message
+        missing = handler.fn(pair["left"], "images", "exif")
+        assert missing.startswith(size) and "Choose your camera below" in missing
+        assert handler.fn(pair["left"], "images", "fov") == size
+    monkeypatch.setattr("geodiff_plugin.app.form.image_size", lambda path, name: (64, 40))
     for name, more in (
-        ("a.HEIC", "; browsers cannot show HEIC"),
-        ("a.heif", "; browsers cannot show HEIC"),
+        ("a.HEIC", "; browsers cannot display HEIC"),
+        ("a.heif", "; browsers cannot display HEIC"),
         ("a.png", ""),
     ):
-        assert handler.fn(name) == f'<div class="note">64 x 40 pixels{more}</div>'
+        assert handler.fn(name, "file", "exif") == f'<div class="note">64 x 40 pixels{more}</div>'
 
 
-def test_taps_are_the_ends_of_the_known_length_and_a_third_begins_again(drawn):
+def test_the_left_image_is_shown_for_taps_on_the_ends_of_a_known_length(drawn, pair):
     fields = drawn.form.fields
-    (tap,) = handlers(drawn, fields["left"], "select")
-    (forget,) = [f for f in handlers(drawn, fields["left"], "change") if not f.inputs]
-    state = tap.inputs[0]
-    assert (
-        [output._id for output in tap.outputs]
-        == [state._id, fields["ends"]._id]
-        == [o._id for o in forget.outputs]
-    )
-    assert tap.queue and tap.trigger_mode == "multiple" and tap.concurrency_limit == 1
-    first = tap.fn(state.value, SimpleNamespace(index=[3, 4]))
-    assert first == ([3, 4], "3, 4")
-    second = tap.fn(first[0], SimpleNamespace(index=(50, 60)))
-    assert second == ([3, 4, 50, 60], "3, 4, 50, 60")
-    assert tap.fn(second[0], SimpleNamespace(index=(7, 8))) == ([7, 8], "7, 8")
-    assert forget.fn() == ([], "")
-    assert all(
-        not f.queue and f.show_progress == "hidden"
-        for f in (forget, *handlers(drawn, fields["way"], "change"))
-    )
+    of_field = handlers(drawn, fields["scale_input"], "change")
+    (handler,) = [f for f in of_field if [each.elem_id for each in f.outputs] == ["known-image"]]
+    html = handler.fn(pair["left"], "images", "known")
+    assert 'data-picked="ends" data-width="64" data-height="48"' in html and "data:image/jpeg" in html
+    for left, way, scale in (
+        (None, "images", "known"),
+        (pair["left"], "file", "known"),
+        (pair["left"], "images", "guess"),
+        (__file__, "images", "known"),
+    ):
+        assert handler.fn(left, way, scale) == ""
+    (clear,) = [f for f in handlers(drawn, fields["left"], "change") if not f.inputs]
+    assert clear.fn() == "" and [output._id for output in clear.outputs] == [fields["ends"]._id]
+
+
+def test_a_run_is_named_by_its_files_before_they_are_checked(drawn, pair):
+    values = tuple((drawn.form.initial | pair).values())
+    assert drawn.form.name(values) == "left.png and right.png"
+    assert drawn.form.name(tuple(drawn.form.initial.values())) == "without images"

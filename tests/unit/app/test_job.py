@@ -1,8 +1,12 @@
-"""A job of the page: what a visitor filled in as options, its limits, and its stages."""
+"""A job of the page: what a visitor filled in as options and assumptions, its limits, and its stages."""
 
 import dataclasses
 import json
+import math
+import shutil
+import struct
 import threading
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,12 +14,24 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.app import job
-from geodiff_plugin.app.job import CameraFields, Priors, options_of, photograph_size, run_job
-from geodiff_plugin.app.keeping import Stopped
+from geodiff_plugin.app.job import (
+    EXAMPLES,
+    GUESSES,
+    CameraFields,
+    Priors,
+    image_size,
+    pair_name,
+    request_of,
+    run_job,
+    states_focal_length,
+    write_job,
+)
+from geodiff_plugin.app.lenses import LENSES
+from geodiff_plugin.app.messages import PageError
+from geodiff_plugin.app.sessions import Stopped
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.messages import Message
 
 LENS = {"fx": 60.0, "fy": 61.0, "cx": 31.0, "cy": 22.0}
 FULL = {"calib": ("a.txt", "b.txt"), "lens": LENS, "cx_right": 35.5, "baseline": 0.12}
@@ -38,6 +54,10 @@ def changed(options: DepthOptions) -> dict:
     return {name: value for name, value in vars(options).items() if value != defaults.get(name)}
 
 
+def fov_of(fx: float, width: int = 64) -> float:
+    return math.degrees(2 * math.atan(width / 2 / fx))
+
+
 @pytest.mark.parametrize(
     ("way", "more", "expected"),
     [
@@ -49,83 +69,168 @@ def changed(options: DepthOptions) -> dict:
             {"lens": LENS | {"fy": None, "cx": 0.0}},
             {"baseline": 0.12, "cx_right": 35.5, "fx": 60.0, "cx": 0.0, "cy": 22.0},
         ),
-        ("photographs", {}, {"baseline": 0.12, "estimate_pose": True, **LENS}),
-        ("photographs", {"lens": LENS | {"fx": None}}, {"baseline": 0.12, "estimate_pose": True}),
+        ("images", {}, {"baseline": 0.12, "estimate_pose": True}),
+        ("images", {"camera": "fx"}, {"baseline": 0.12, "estimate_pose": True, **LENS}),
+        ("images", {"camera": "fov", "fov": 71.0}, {"baseline": 0.12, "estimate_pose": True, "fov": 71.0}),
         (
-            "photographs",
-            {"baseline": None, "known_length": 2.5, "ends": "-1, 2.5;30 y 4"},
-            {"estimate_pose": True, "known_length": "-1,2.5,30,4,2.5", **LENS},
+            "images",
+            {"scale_input": "known", "known_length": 2.5, "ends": "-1, 2.5;30 y 4"},
+            {"estimate_pose": True, "known_length": "-1,2.5,30,4,2.5"},
+        ),
+        (
+            "images",
+            {"scale_input": "guess", "guess": "One step to the side, about 70 cm"},
+            {"estimate_pose": True, "baseline": 0.7},
         ),
     ],
 )
 def test_only_what_the_way_needs_becomes_an_option(way, more, expected, pair):
-    options = options_of(*pair, CameraFields(way, **(FULL | more)), seed=7, steps=3)
+    request = request_of(*pair, CameraFields(way, **(FULL | more)), seed=7, steps=3)
     own = {"left": Path(pair[0]), "right": Path(pair[1]), "export": ("glb", "mesh"), "seed": 7, "steps": 3}
-    assert changed(options) == own | expected
+    assert changed(request.options) == own | expected and request.name == "left.png and right.png"
+
+
+def test_a_camera_of_the_list_is_a_field_of_view_and_an_assumption(pair):
+    for lens in LENSES.values():
+        request = request_of(*pair, CameraFields("images", **(FULL | {"camera": lens.name})))
+        diagonal_px = math.hypot(64, 64 / lens.ratio)
+        fx = lens.equivalent_mm / math.hypot(36, 24) * diagonal_px
+        assert request.options.fov == pytest.approx(fov_of(fx)) and request.options.fx is None
+        (assumed,) = request.assumptions
+        assert assumed.code == "camera.from-list" and lens.name in assumed
+        assert f"{lens.equivalent_mm:.0f} mm" in assumed
+    typed = request_of(*pair, CameraFields("images", **(FULL | {"camera": "fov", "fov": 70.0})))
+    assert [each.code for each in typed.assumptions] == ["camera.from-fov"]
+    assert request_of(*pair, CameraFields("images", **FULL)).assumptions == ()
+
+
+def test_lenses_of_phones_show_the_long_side_of_their_sensor():
+    """Published horizontal fields of view, of a 4:3 sensor, from the diagonal ones."""
+    lens = LENSES["Google Pixel 8: main lens"]
+    assert fov_of(lens.fx((4000, 3000)), 4000) == pytest.approx(
+        math.degrees(2 * math.atan(0.8 * math.tan(math.radians(41)))), abs=1e-6
+    )
+    assert lens.fx((4000, 2250)) == lens.fx((4000, 3000)) == lens.fx((3000, 4000)), "16:9 is a crop"
+    assert 23 < LENSES["Samsung Galaxy S22, S23, S24: main lens"].equivalent_mm < 24.5
+    assert all(10 < lens.equivalent_mm <= 50 for lens in LENSES.values())
+
+
+def test_the_scale_has_the_uncertainty_of_its_source(pair):
+    measured = CameraFields("images", **(FULL | {"baseline_error": 0.006}))
+    assert request_of(*pair, measured).scale_rel_std == pytest.approx(0.05)
+    assert request_of(*pair, CameraFields("images", **FULL)).scale_rel_std is None
+    for guess, (metres, spread) in GUESSES.items():
+        request = request_of(*pair, CameraFields("images", scale_input="guess", guess=guess))
+        assert request.options.baseline == metres and request.scale_rel_std == spread
+        (assumed,) = request.assumptions
+        assert assumed.code == "scale.guessed" and f"{metres:g} m" in assumed
+    known = CameraFields("images", scale_input="known", known_length=0.8, ends="1.5, 2.4, 7, 9")
+    request = request_of(*pair, known)
+    assert request.pixels == [(2, 2), (7, 9)] and request.scale_rel_std is None
 
 
 @pytest.mark.parametrize(
-    ("way", "more", "said"),
+    ("way", "more", "message"),
     [
+        ("file", {"calib": ()}, "The calibration file is missing. Choose one, or choose to estimate"),
+        ("numbers", {"baseline": None}, "Enter the distance between the cameras as well."),
+        ("numbers", {"baseline": -0.1}, "The distance between the cameras must be above 0."),
+        ("numbers", {"lens": LENS | {"fx": None}}, "Enter fx in pixels as well."),
+        ("numbers", {"lens": {}, "baseline": None}, "Enter fx in pixels and the distance between the"),
+        ("images", {"baseline": None}, "Images alone have no scale. Enter the measured distance"),
+        ("images", {"baseline": 0.0}, "The measured distance must be above 0."),
+        ("images", {"baseline_error": -1.0}, "Its accuracy must be above 0."),
+        ("images", {"camera": "fx", "lens": {}}, "Enter fx, the focal length in pixels, or choose"),
+        ("images", {"camera": "fov"}, "Enter the field of view across the width of the image"),
+        ("images", {"camera": "fov", "fov": 190.0}, "1 to 170 degrees"),
+        ("images", {"scale_input": "known"}, "Images alone have no scale. Enter the known length."),
+        ("images", {"scale_input": "known", "known_length": 2.0}, "Mark both ends of the known length"),
         (
-            "file",
-            {"calib": ()},
-            "The calibration file is missing: choose one, or give focal length and baseline.",
+            "images",
+            {"scale_input": "known", "known_length": 2.0, "ends": "1 2 3 4 5"},
+            "Mark both ends of the known length",
         ),
-        ("numbers", {"baseline": None}, "Give baseline as well: fx is in pixels, the baseline in metres."),
-        ("numbers", {"lens": LENS | {"fx": None}}, "Give fx as well"),
-        ("numbers", {"lens": {}, "baseline": None}, "Give fx and baseline as well"),
-        ("photographs", {"baseline": None}, "Photographs have no unit: measure the distance between"),
-        (
-            "photographs",
-            {"known_length": 2.0},
-            "Give the distance between the cameras, or a length .*, not both.",
-        ),
-        (
-            "photographs",
-            {"baseline": None, "known_length": 2.0},
-            "The ends of the known length are two pixels",
-        ),
-        ("photographs", {"baseline": None, "known_length": 2.0, "ends": "1 2 3 4 5"}, "are two pixels"),
     ],
 )
-def test_what_a_way_lacks_is_said(way, more, said, pair):
-    with pytest.raises(InputError, match=said):
-        options_of(*pair, CameraFields(way, **(FULL | more)))
+def test_a_missing_field_is_named_with_what_to_do(way, more, message, pair):
+    with pytest.raises(PageError, match=message):
+        request_of(*pair, CameraFields(way, **(FULL | more)))
 
 
-def test_a_missing_photograph_is_named(pair):
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"near": 3.0, "far": 2.0}, "The nearest depth must be less than the farthest one"),
+        ({"near": -1.0}, "must be above 0"),
+        ({"steps": 101}, "Steps must be between 0 and 100"),
+        ({"ensemble": 21}, "Ensemble must be between 0 and 20"),
+        ({"resolution": 4097}, "Resolution must be between 0 and 4096"),
+    ],
+)
+def test_settings_out_of_range_are_named(more, message, pair):
+    with pytest.raises(PageError, match=message):
+        request_of(*pair, CameraFields("numbers", **FULL), **more)
+
+
+def test_without_poselib_estimation_is_rejected_before_any_work(pair, monkeypatch):
+    monkeypatch.setattr(job.importlib.util, "find_spec", lambda name: None)
+    assert not job.can_estimate()
+    with pytest.raises(PageError, match=r"PoseLib is not installed.*geodiff-plugin\[app\]"):
+        request_of(*pair, CameraFields("images", **FULL))
+    assert request_of(*pair, CameraFields("numbers", **FULL)).options.fx == 60.0
+
+
+def test_an_image_states_its_focal_length_unless_it_was_cropped(tmp_path):
+    for name, size, focal in (("with", (64, 48), 26), ("without", (64, 48), None), ("cropped", (48, 48), 26)):
+        exif = Image.Exif()
+        if focal:
+            exif.get_ifd(0x8769).update({0xA405: focal, 0xA002: 64, 0xA003: 48})
+        Image.new("RGB", size).save(tmp_path / f"{name}.jpg", exif=exif)
+        assert states_focal_length(str(tmp_path / f"{name}.jpg")) == (name == "with")
+
+
+def test_a_pair_is_named_by_its_files_or_as_the_example_that_it_copies(tmp_path, pair):
+    assert pair_name(*map(Path, pair)) == "left.png and right.png"
+    assert [example.label for example in EXAMPLES] == ["Playroom", "Hallway", "Bedroom", "Desk", "Street"]
+    for example in EXAMPLES:
+        copies = [tmp_path / "l.bin", tmp_path / "r.bin"]
+        shutil.copyfile(example.left, copies[0])
+        shutil.copyfile(example.right, copies[1])
+        assert pair_name(*copies) == example.label
+        assert pair_name(copies[1], copies[0]) == "r.bin and l.bin", "swapped, it is no example"
+
+
+def test_a_missing_image_is_named(pair):
     for left, right, name in ((None, pair[1], "left"), (pair[0], None, "right")):
-        with pytest.raises(
-            InputError, match=f"the {name} photograph is missing: drop a picture into its field"
-        ):
-            options_of(left, right, CameraFields("numbers", **FULL))
-    with pytest.raises(InputError, match="the right photograph must be an image file"):
-        options_of(pair[0], __file__, CameraFields("numbers", **FULL))
+        with pytest.raises(PageError, match=f"The {name} image is missing. Drop a file into its field"):
+            request_of(left, right, CameraFields("numbers", **FULL))
+    with pytest.raises(InputError) as rejected:
+        request_of(pair[0], __file__, CameraFields("numbers", **FULL))
+    assert rejected.value.code == "image.unreadable"
 
 
-def test_a_photograph_has_at_most_sixteen_megapixels(tmp_path):
+def test_an_image_has_at_most_sixteen_megapixels(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
     for size, fits in (((4000, 4000), True), ((4000, 4001), False)):
         Image.new("1", size).save(tmp_path / "a.png", exif=exif)
         if fits:
-            assert photograph_size(str(tmp_path / "a.png"), "x") == size
+            assert image_size(str(tmp_path / "a.png"), "x") == size
         else:
-            with pytest.raises(
-                InputError, match="x must be an image of at most 16 megapixels; got 4001x4000, which is 16 "
-            ):
-                photograph_size(str(tmp_path / "a.png"), "x")
+            with pytest.raises(PageError, match="X has 4001 x 4000 pixels, 16 megapixels"):
+                image_size(str(tmp_path / "a.png"), "x")
 
 
 def test_a_prior_is_loaded_once_by_its_name_on_its_device(monkeypatch):
     loaded = []
     monkeypatch.setattr(
-        job, "load_guided_prior", lambda *given: loaded.append(given) or f"pipe {len(loaded)}"
+        job,
+        "load_guided_prior",
+        lambda *given, dtype: loaded.append((*given, dtype)) or f"pipe {len(loaded)}",
     )
-    priors = Priors(("one", "two"), torch.device("cpu"))
+    priors = Priors(("one", "two"), torch.device("cpu"), "float16")
     assert [priors.get(name) for name in ("two", "one", "two")] == ["pipe 1", "pipe 2", "pipe 1"]
-    assert loaded == [("two", torch.device("cpu")), ("one", torch.device("cpu"))]
+    assert loaded == [(name, torch.device("cpu"), "float16") for name in ("two", "one")]
     with pytest.raises(InputError, match="prior must be one of"):
         priors.get("three")
 
@@ -134,9 +239,13 @@ class Job:
     """The parts of a job that ``run_job`` calls, each of which records what it was given."""
 
     def __init__(self, monkeypatch, tmp_path, unit="m", steps=2):
-        self.told, self.steps = [], steps
+        self.reported, self.steps, self.assumed = [], steps, []
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-        guidance = SimpleNamespace(unit=unit, denoising_steps=lambda asked, default: asked or default)
+        guidance = SimpleNamespace(
+            unit=unit,
+            denoising_steps=lambda asked, default: asked or default,
+            add_findings=self.assumed.extend,
+        )
         self.inputs = SimpleNamespace(guidance=guidance)
         self.priors = SimpleNamespace(get=self.prior)
         for name in ("read_pair", "run_pair", "write_pair"):
@@ -155,83 +264,95 @@ class Job:
         for _ in range(self.steps):
             assert callback_on_step_end(pipe, 0, None, {"latents": 1}) == {}
         self.log = log
-        return SimpleNamespace(
-            output=SimpleNamespace(assumed=(Message("camera.from-exif", "A sentence."),)), log=log
-        )
+        return SimpleNamespace(output="output", log=log)
 
-    def write_pair(self, folder, run):
+    def write_pair(self, folder, run, max_points):
+        assert max_points == 500_000
         self.folder = folder.place
         self.run = run
         folder.write(lambda place: (place / "report.json").write_text(json.dumps({})))
         return "result"
 
-    def __call__(self, options, stop=None):
-        return run_job(options, self.priors, stop or threading.Event(), lambda *told: self.told.append(told))
+    def __call__(self, request, stop=None):
+        return run_job(
+            request, self.priors, stop or threading.Event(), lambda *reported: self.reported.append(reported)
+        )
 
 
 @pytest.fixture
-def options(pair):
-    return options_of(*pair, CameraFields("numbers", **FULL), prior="tiny", steps=2, ensemble=3)
+def request_of_pair(pair):
+    return request_of(*pair, CameraFields("numbers", **FULL), prior="tiny", steps=2, ensemble=3)
 
 
-def test_a_job_tells_its_stages_and_writes_into_a_folder_of_its_own(options, monkeypatch, tmp_path):
+def changed_request(request, **options):
+    return dataclasses.replace(request, options=dataclasses.replace(request.options, **options))
+
+
+def test_a_job_reports_its_stages_and_writes_into_a_folder_of_its_own(request_of_pair, monkeypatch, tmp_path):
     run = Job(monkeypatch, tmp_path, steps=7)
-    assert run(options) == "result"
-    assert run.names == ("left.png", "right.png") and run.name == "tiny"
+    done = run(request_of_pair)
+    assert done.output == "output" and not (tmp_path / "results").exists()
+    assert write_job(done) == "result" and run.run is done
+    assert run.names == ("left.png", "right.png") and run.name == "tiny" and run.assumed == []
     assert run.folder.target.parent == tmp_path / "results" == job.results_folder()
     assert len(run.folder.target.name) == 32 and (run.folder.target / "report.json").is_file()
-    assert list(run.log.seconds) == ["calibration"] and [m.code for m in run.log.warnings] == [
-        "camera.from-exif"
-    ]
-    shares, names = zip(*run.told, strict=True)
+    assert list(run.log.seconds) == ["calibration"] and run.log.findings == []
+    fractions, names = zip(*run.reported, strict=True)
     assert names == (
-        "Reading the photographs and cameras",
+        "Reading images and cameras",
         "Loading the prior",
-        "Comparing the views",
+        "Matching the views",
         *(f"Guided step {min(n, 6)} of 6" for n in range(1, 8)),
-        "Drawing",
     )
-    assert shares == pytest.approx((0, 0.05, 0.1, *(0.2 + 0.7 * min(n / 6, 1) for n in range(1, 8)), 0.95))
+    assert fractions == pytest.approx((0, 0.05, 0.1, *(0.2 + 0.75 * min(n / 6, 1) for n in range(1, 8))))
     first = run.folder.target
-    run.told.clear()
-    run(dataclasses.replace(options, steps=None))
-    assert run.folder.target != first and run.told[3][1] == "Guided step 1 of 9", (
+    run.reported.clear()
+    write_job(run(changed_request(request_of_pair, steps=None)))
+    assert run.folder.target != first and run.reported[3][1] == "Guided step 1 of 9", (
         "the prior's own number of steps"
     )
 
 
-def test_a_stop_ends_a_job_before_its_next_stage_and_leaves_nothing(options, monkeypatch, tmp_path):
+def test_assumptions_of_the_page_are_findings_of_the_call(pair, monkeypatch, tmp_path):
+    run = Job(monkeypatch, tmp_path)
+    request = request_of(*pair, CameraFields("images", **(FULL | {"camera": "fov", "fov": 70.0})))
+    run(request)
+    assert [finding.code for finding in run.assumed] == ["camera.from-fov"]
+
+
+def test_a_stop_ends_a_job_before_its_next_stage_and_leaves_nothing(request_of_pair, monkeypatch, tmp_path):
     run, stop = Job(monkeypatch, tmp_path), threading.Event()
     stages = []
 
-    def tell(share, name):
+    def notify(fraction, name):
         stages.append(name)
         if name.startswith("Guided step 2"):
             stop.set()
 
     run.steps = 5
     with pytest.raises(Stopped):
-        run_job(options, run.priors, stop, tell)
-    assert stages[-1] == "Guided step 2 of 6" and not list((tmp_path / "results").iterdir())
+        run_job(request_of_pair, run.priors, stop, notify)
+    assert stages[-1] == "Guided step 2 of 6" and not (tmp_path / "results").exists()
     stages.clear()
     with pytest.raises(Stopped):
-        run_job(options, run.priors, stop, tell)
+        run_job(request_of_pair, run.priors, stop, notify)
     assert stages == []
 
 
-def test_a_job_without_a_unit_is_refused(options, monkeypatch, tmp_path):
+def test_a_job_without_a_unit_is_rejected(request_of_pair, monkeypatch, tmp_path):
     run = Job(monkeypatch, tmp_path, unit=None)
-    with pytest.raises(InputError, match="This file has no unit: give the distance between the two cameras"):
-        run(options)
-    assert [name for _, name in run.told] == ["Reading the photographs and cameras"]
+    with pytest.raises(
+        PageError, match="The calibration has no unit. Enter the distance between the cameras"
+    ):
+        run(request_of_pair)
+    assert [name for _, name in run.reported] == ["Reading images and cameras"]
 
 
-@pytest.mark.parametrize(
-    ("name", "most", "word"),
-    [("steps", 100, "steps"), ("ensemble", 20, "members"), ("resolution", 4096, "resolution")],
-)
-def test_the_page_allows_less_than_the_command(name, most, word, options, monkeypatch, tmp_path):
-    run = Job(monkeypatch, tmp_path)
-    assert run(dataclasses.replace(options, **{name: most})) == "result"
-    with pytest.raises(InputError, match=f"{word} must be between 0 and {most}; got {most + 1}"):
-        run(dataclasses.replace(options, **{name: most + 1}))
+def test_an_image_that_is_far_too_large_is_rejected_by_its_head(tmp_path):
+    path = tmp_path / "huge.png"
+    # 900 megapixels, none of them in the file
+    header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 1, 0, 0, 0, 0)
+    chunks = (b"\0\0\0\r", header, struct.pack(">I", zlib.crc32(header)), bytes(4), b"IEND\xaeB`\x82")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    with pytest.raises(PageError, match="The left image is too large. This page takes images of at most 16"):
+        image_size(str(path), "the left image")

@@ -3,6 +3,8 @@
 import asyncio
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.app import launch
 
 
@@ -43,9 +45,9 @@ def test_an_answer_keeps_its_headers_and_gets_those_of_the_guard():
     assert body == {"type": "http.response.body", "body": b"page"}
     start, body = answers(request(host="localhost:7860", origin="http://evil"))
     assert start["status"] == 403 and start["headers"] == [*launch.HEADERS]
-    assert body["body"] == b"Requests of other sites are refused."
+    assert body["body"] == b"Cross-site requests are rejected."
     start, body = answers(request(host="evil:7860"))
-    assert start["status"] == 403 and body["body"] == b"This server is reached as localhost only."
+    assert start["status"] == 403 and body["body"] == b"This server accepts requests to localhost only."
     scope = {"type": "websocket", "headers": []}
     assert answers(scope)[0]["headers"] == [(b"x-page", b"1")]
 
@@ -70,9 +72,9 @@ def test_an_answer_keeps_its_headers_and_gets_those_of_the_guard():
         ({}, ("127.0.0.1", 1), True),
     ],
 )
-def test_requests_of_other_sites_and_under_other_names_are_refused(headers, server, refused):
+def test_requests_of_other_sites_and_under_other_names_are_rejection(headers, server, refused):
     raw = {name.encode(): value.encode() for name, value in headers.items()}
-    assert bool(launch._refused(raw, server)) == refused
+    assert bool(launch._rejection(raw, server)) == refused
 
 
 def test_the_page_loads_nothing_from_elsewhere_and_is_framed_by_nobody():
@@ -99,7 +101,7 @@ def page(monkeypatch, tmp_path):
 
         def launch(self, **options):
             seen.launch = options
-            return "served"
+            return "app", "http://served", None
 
     def build(priors):
         seen.priors = priors
@@ -107,26 +109,30 @@ def page(monkeypatch, tmp_path):
 
     monkeypatch.setattr(module, "build_page", build)
     monkeypatch.setattr(
-        job, "load_guided_prior", lambda name, device: seen.loaded.append((name, str(device)))
+        job, "load_guided_prior", lambda name, device, dtype: seen.loaded.append((name, str(device), dtype))
     )
     monkeypatch.setattr(
         launch.atexit, "register", lambda *given, **options: seen.exits.append((given, options))
     )
+    monkeypatch.setattr(launch, "_remove_leftovers", lambda: None)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     for name in ("GRADIO_TEMP_DIR", *launch.QUIET):
         monkeypatch.setenv(name, "before")
-    return seen
+    yield seen
+    for (call, *_), _ in seen.exits:
+        if call.__name__ == "close":  # of the lock
+            call()
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_launched_page_has_a_folder_of_its_own_and_its_limits(page, tmp_path):
-    from geodiff_plugin.app.form import EXAMPLES
-    from geodiff_plugin.app.look import CSS
+    from geodiff_plugin.app.job import EXAMPLES
     from geodiff_plugin.app.page import THEME
+    from geodiff_plugin.app.templates import CSS
 
-    assert launch.launch_page(("one", "two"), "cpu", server_port=9) == "served"
-    assert page.priors.names == ("one", "two") and page.loaded == [("one", "cpu")]
+    assert launch.launch_page(("one", "two"), "cpu", "bfloat16", server_port=9)[1] == "http://served"
+    assert page.priors.names == ("one", "two") and page.loaded == [("one", "cpu", "bfloat16")]
     folder = Path(tempfile.gettempdir())
     assert (
         folder.parent == tmp_path and folder.name.startswith("geodiff-app-") and (folder / "results").is_dir()
@@ -143,7 +149,7 @@ def test_a_launched_page_has_a_folder_of_its_own_and_its_limits(page, tmp_path):
     assert given["head"].startswith("<script>") and "scene-data" in given["head"]
     assert given["allowed_paths"] == [str(folder / "results"), *(str(example.folder) for example in EXAMPLES)]
     assert given["max_file_size"] == "40mb" and given["footer_links"] == []
-    assert given["state_session_capacity"] == 200
+    assert given["state_session_capacity"] == 200 and given["quiet"]
     (middleware,) = given["app_kwargs"]["middleware"]
     assert middleware.cls is launch._Guard
 
@@ -155,32 +161,113 @@ def test_the_bundled_prior_is_the_only_one_unless_others_are_named(page):
     assert page.priors.names == ("bundled",) and page.loaded[0][0] == "bundled"
 
 
-def test_a_page_is_served_where_it_was_asked_for_until_the_process_is_ended(monkeypatch):
-    seen, handlers = [], {}
-    monkeypatch.setattr(launch, "launch_page", lambda *given, **options: seen.append((given, options)))
-    monkeypatch.setattr(signal, "signal", lambda which, handler: handlers.update({which: handler}))
-    launch.run_app(("one",), "cuda", "0.0.0.0", 7861, True)
+class Interrupted:
+    """An event whose wait ends with Ctrl-C."""
+
+    def wait(self):
+        raise KeyboardInterrupt
+
+
+@pytest.fixture
+def served(monkeypatch):
+    seen = SimpleNamespace(given=[], handlers={})
+
+    def launch_page(*given, **options):
+        seen.given.append((given, options))
+        return "app", "http://there", None
+
+    monkeypatch.setattr(launch, "launch_page", launch_page)
+    monkeypatch.setattr(signal, "signal", lambda which, handler: seen.handlers.update({which: handler}))
+    monkeypatch.setattr(launch.threading, "Event", Interrupted)
+    return seen
+
+
+def test_a_page_is_served_where_it_was_asked_for_until_the_process_is_ended(served, capsys):
+    launch.run_app(("one",), "cuda", "float16", "0.0.0.0", 7861, True)
     where = {"server_name": "0.0.0.0", "server_port": 7861, "inbrowser": True, "share": False}
-    assert seen == [((("one",), "cuda"), where)] and list(handlers) == [signal.SIGTERM]
+    assert served.given == [((("one",), "cuda", "float16"), where | {"prevent_thread_lock": True})]
+    assert list(served.handlers) == [signal.SIGTERM]
+    assert capsys.readouterr().out == "Serving on http://there (Ctrl-C stops the server)\n", (
+        "and nothing of gradio"
+    )
     with pytest.raises(SystemExit) as ended:
-        handlers[signal.SIGTERM](15, None)
+        served.handlers[signal.SIGTERM](15, None)
     assert ended.value.code == 0
+
+
+def test_missing_requirements_are_reported_at_the_start(served, monkeypatch, capsys):
+    monkeypatch.setattr(launch.importlib.util, "find_spec", lambda name: None)
+    launch.run_app(("one",), "cpu", "float32", "127.0.0.1", None, False)
+    reported = capsys.readouterr().err.splitlines()
+    assert [line.split(",")[0] for line in reported] == ["Without poselib", "Without pillow_heif"]
+    assert all("pip install 'geodiff-plugin[app]'" in line for line in reported)
+
+
+@pytest.mark.skipif(not launch.fcntl, reason="Windows has no such locks")
+def test_leftovers_of_killed_servers_are_removed_and_those_of_running_ones_stay(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    at_exit = []
+    monkeypatch.setattr(launch.atexit, "register", lambda call, *_, **__: at_exit.append(call))
+    killed, running, young = (tmp_path / f"geodiff-app-{name}" for name in ("killed", "running", "young"))
+    for folder in (killed, running, young):
+        (folder / "upload").mkdir(parents=True)
+        (folder / "upload" / "left.png").touch()
+    (killed / "lock").touch()
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "lock").touch()
+    with (running / "lock").open("wb") as lock:
+        assert not launch._is_locked(lock)
+        own = Path(launch._new_folder())
+        launch._remove_leftovers()
+        assert not killed.exists() and running.exists() and young.exists() and other.exists() and own.exists()
+    launch._remove_leftovers()
+    assert not running.exists() and own.exists(), "the process that locked it has ended"
+    at_exit[-1]()
+
+
+def test_a_server_of_its_own_process_is_killed_and_the_next_one_cleans_up(tmp_path):
+    if not launch.fcntl:
+        pytest.skip("Windows has no such locks")
+    code = "from geodiff_plugin.app import launch; print(launch._new_folder(), flush=True); input()"
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    server = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    folder = Path(server.stdout.readline().strip())
+    clean = [sys.executable, "-c", "from geodiff_plugin.app import launch; launch._remove_leftovers()"]
+    subprocess.run(clean, check=True, env=environment)
+    assert folder.parent == tmp_path and folder.is_dir(), "it is running"
+    server.kill()
+    server.communicate()
+    subprocess.run(clean, check=True, env=environment)
+    assert not folder.exists()
 
 
 def test_a_port_that_is_taken_is_a_sentence_and_another_error_stays(monkeypatch):
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     for said, port, expected in (
-        ("Cannot find empty port in range", 8000, "got 1.2.3.4 and 8000, taken by another program"),
-        ("Cannot find empty port in range", None, "got 1.2.3.4 and no free port, taken"),
+        ("Cannot find empty port in range", 8000, "got 1.2.3.4 and 8000, which is in use"),
+        ("Cannot find empty port in range", None, "got 1.2.3.4 and no free port, which is in use"),
     ):
         error = OSError(said)
         monkeypatch.setattr(launch, "launch_page", lambda *_, error=error, **__: raising(error))
         with pytest.raises(InputError, match=expected):
-            launch.run_app(("a",), "cpu", "1.2.3.4", port, False)
+            launch.run_app(("a",), "cpu", "float32", "1.2.3.4", port, False)
     monkeypatch.setattr(launch, "launch_page", lambda *_, **__: raising(OSError("disk")))
     with pytest.raises(OSError, match=r"\Adisk\Z"):
-        launch.run_app(("a",), "cpu", "1.2.3.4", 1, False)
+        launch.run_app(("a",), "cpu", "float32", "1.2.3.4", 1, False)
 
 
 def raising(error):
     raise error
+
+
+def test_without_gradio_it_states_what_to_install(monkeypatch):
+    monkeypatch.setattr(launch.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'geodiff-plugin\[app\]'"):
+        launch.launch_page()

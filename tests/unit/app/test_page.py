@@ -2,18 +2,33 @@
 
 import asyncio
 import gc
+import itertools
+import json
 import re
 import shutil
+import threading
+from dataclasses import replace
 from types import SimpleNamespace
+from zipfile import ZipFile
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
+from PIL import Image
 
-from geodiff_plugin._checks import InputError, UnknownFormatError
-from geodiff_plugin.app import keeping, look, results
-from geodiff_plugin.app.job import Priors
-from geodiff_plugin.app.keeping import Stopped
-from geodiff_plugin.app.shown import kept_in_view
+from geodiff_plugin import enable_geometry_guidance
+from geodiff_plugin._internal.checks import InputError, UnknownFormatError, bad_value
+from geodiff_plugin.app import results, sessions, templates
+from geodiff_plugin.app.job import EXAMPLES, CameraFields, Priors, Request, request_of, run_job, write_job
+from geodiff_plugin.app.messages import ERRORS_ON_PAGE, PageError
+from geodiff_plugin.app.results import Measurement
+from geodiff_plugin.app.sessions import Result, Stopped
+from geodiff_plugin.app.shown import clean_report, load, save, shown_of, visible_in_viewer
+from geodiff_plugin.formats import read_calibration, read_image
+from geodiff_plugin.jobs import DepthOptions
 from tests.unit.app.made_result import made_result
 
 gr = pytest.importorskip("gradio", reason="gradio is in the extra app")
@@ -53,12 +68,12 @@ def page():
 def desk(page, tmp_path, monkeypatch):
     """The desk of the page with no visitors, whose temporary files are in a folder of the test."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr(keeping, "gc", SimpleNamespace(collect=lambda: None))  # takes long
+    monkeypatch.setattr(sessions, "gc", SimpleNamespace(collect=lambda: None))  # takes long
     page.desk.sessions._of.clear()
-    page.desk.sessions.keeper._shown.clear()
+    page.desk.sessions.store._results.clear()
     yield page.desk
-    for secret in list(page.desk.sessions.keeper._shown):
-        page.desk.sessions.keeper.drop(secret)
+    for secret in list(page.desk.sessions.store._results):
+        page.desk.sessions.store.drop(secret)
 
 
 def asks(name: str = "tab") -> SimpleNamespace:
@@ -66,109 +81,116 @@ def asks(name: str = "tab") -> SimpleNamespace:
 
 
 def named(desk, values: dict) -> dict:
-    """Values of components by what they are for."""
-    names = {component: name for name, component in vars(desk.panels).items()}
-    names |= {component: name for name, component in vars(desk.memory).items()}
-    return {names[component]: value for component, value in values.items()}
+    """Values of components by what they are for, without those that do not change."""
+    names = {
+        component: name for name, component in vars(desk.panels).items() if name not in ("undo", "clear")
+    }
+    names |= {desk.secret: "secret", desk.progress: "progress", desk.form.stop: "stop"}
+    names |= {component: f"field {name}" for name, component in desk.form.fields.items()}
+    return {names[component]: value for component, value in values.items() if value != gr.skip()}
+
+
+class Screen:
+    """What a tab shows: every update is applied to it, as the browser does."""
+
+    def __init__(self, desk, visitor="tab"):
+        self.desk, self.visitor = desk, visitor
+        self.shows = {"secret": ""}
+
+    def apply(self, update: dict) -> dict:
+        changes = named(self.desk, update)
+        self.shows |= changes
+        return changes
+
+    def click(self, x: int, y: int) -> dict:
+        return self.apply(self.desk.add_point(asks(self.visitor), self.shows["secret"], f"{x}, {y}"))
 
 
 @pytest.fixture
-def run(page, desk, monkeypatch, tmp_path):
-    """``run(shown)``: a click on the button whose job gives this result, or raises this error."""
+def jobs(page, desk, monkeypatch, tmp_path):
+    """Replaces jobs: ``jobs.outcome`` is the next result, or an error; ``jobs.during`` is called in it."""
+    numbers = itertools.count()
+    made = SimpleNamespace(outcome=None, during=lambda: None, reported=[])
 
-    def call(outcome, visitor="tab", during=lambda: None, told=None):
-        def job(wanted, priors, stop, progress):
-            assert (wanted, priors) == ("wanted", desk.priors) and not stop.is_set()
-            progress(0.5, "half")
-            during()
-            if isinstance(outcome, Exception):
-                raise outcome
-            return outcome
+    def job(request, priors, stop, progress):
+        assert priors is desk.priors
+        progress(0.5, "half")
+        made.during()
+        if isinstance(made.outcome, Exception):
+            raise made.outcome
+        if stop.is_set():
+            raise Stopped
+        return made.outcome
 
-        monkeypatch.setattr(page.module, "run_job", job)
-        monkeypatch.setattr(page.module, "shown_of", lambda done: done)
-        monkeypatch.setattr(
-            type(desk.form), "options", lambda _, filled: "wanted" if filled == (1, 2) else None
-        )
-        progress = (lambda *_: None) if told is None else (lambda *now: told.append(now))
-        return named(desk, desk.estimate(asks(visitor), progress, 1, 2))
+    def request(_, filled):
+        if filled and isinstance(filled[0], Exception):
+            raise filled[0]
+        return Request(DepthOptions(left=tmp_path / "left.png", right=tmp_path / "right.png"), "a pair")
 
-    return call
+    def write(shown):
+        folder = tmp_path / f"out{next(numbers)}"
+        folder.mkdir()
+        (folder / "depth.npy").write_bytes(b"x")
+        return folder
+
+    monkeypatch.setattr(page.module, "run_job", job)
+    monkeypatch.setattr(page.module, "shown_of", lambda done, name, scale: done)
+    monkeypatch.setattr(page.module, "write_job", write)
+    monkeypatch.setattr(page.module, "clean_report", lambda folder: folder)
+    monkeypatch.setattr(type(desk.form), "request", request)
+    monkeypatch.setattr(type(desk.form), "name", lambda *_: "what runs")
+    return made
 
 
-def result(tmp_path, name="out"):
-    folder = tmp_path / name
-    folder.mkdir()
-    (folder / "depth.npy").write_bytes(b"x")
-    return made_result(folder=folder)
+def run(desk, jobs, outcome, screen: Screen, during=lambda: None, filled=(1, 2)) -> list[dict]:
+    """A click on the button whose job gives this result, or raises this error; returns all updates."""
+    jobs.outcome, jobs.during = outcome, during
+    steps = desk.estimate(asks(screen.visitor), lambda *now: jobs.reported.append(now), *filled)
+    return [screen.apply(update) for update in steps]
 
 
-def is_drawn(values: dict, shown, pixels=(), paths=()) -> bool:
+def is_drawn(values: dict, result: Result, paths=None) -> bool:
     """Whether every panel shows this result."""
-    url = {
-        name: results.data_url(results.picture(shown, name)) for name in ("photograph", "depth", "confidence")
-    }
-    measured = results.measurement(shown, list(pixels))
-    assert values["status"] == look.banner(shown)
-    assert values["scene_data"] == look.hidden(results.scene_data(shown))
-    assert values["depth"] == look.compared(url["photograph"], url["depth"])
+    shown, found = result.shown, Measurement.of(result)
+    url = {name: results.data_url(results.map_image(shown, name)) for name in ("depth", "confidence")}
+    assert values["status"] == templates.banner(shown)
+    assert values["scene_data"] == templates.hidden(results.scene_data(shown))
+    assert values["depth"] == templates.compared(url["depth"])
     assert values["legend"] == results.legend_of_depth(shown.depth_m)
     assert f'src="{url["confidence"]}"' in values["confidence"]
     assert values["confidence"].endswith(results.legend_of_confidence())
-    assert values["files"] == look.files(paths)
-    assert values["marks_data"] == look.hidden(results.marks_data(measured.readings))
-    assert values["headline"] == measured.headline and values["readings"] == measured.words
-    assert f'src="{results.data_url(measured.picture)}"' in values["picture"]
+    if paths is not None:
+        assert values["files"] == templates.files(paths, results.PURPOSES)
+    assert values["marks_data"] == templates.hidden(found.marks())
+    assert values["headline"] == found.headline() and values["readings"] == found.html()
     return True
 
 
 def test_the_page_opens_with_a_finished_result(page, desk):
-    first = desk.first
-    values = {name: component.value for name, component in vars(desk.panels).items() if name != "tabs"}
-    assert is_drawn(values, first.shown, first.pixels) and desk.memory.pixels.value == first.pixels
-    assert first.shown.title == "example Playroom, computed beforehand" and len(first.pixels) == 2
-    assert kept_in_view(first.shown).mean() > 0.5
-    ids = {name: component.elem_id for name, component in vars(desk.panels).items()}
-    wanted = {
-        "status": "status",
-        "scene_data": "scene-data",
-        "marks_data": "marks-data",
-        "pick": "pick",
-        "picked": "picked",
-    }
-    wanted |= {
-        "headline": "headline",
-        "depth": "depth",
-        "legend": "depth-legend",
-        "picture": "measure-picture",
-    }
-    wanted |= {
-        "readings": "readings",
-        "pixel": "pixel",
-        "add": "add-point",
-        "confidence": "confidence",
-        "files": "files",
-    }
-    assert {name: ids[name] for name in wanted} == wanted
+    first = page.module.read_first_result()
+    others = ("tabs", "undo", "clear")
+    values = {name: each.value for name, each in vars(desk.panels).items() if name not in others}
+    assert is_drawn(values, first, []) and len(first.pixels) == 2
+    assert first.shown.name == "Playroom" and first.shown.precomputed
+    assert "Playroom, precomputed" in values["status"]
+    assert first.shown.image.shape[:2] == first.shown.depth_m.shape
+    found = Measurement.of(first)
+    (segment,) = found.segments
+    assert 0.1 < segment.length_m < 1 and 0 < segment.spread_m < segment.length_m / 3
+    assert segment.text in found.headline() and "use your own pair" in found.headline()
+    assert visible_in_viewer(first.shown).mean() > 0.5
+
+
+def test_components_have_the_ids_that_styles_and_scripts_use(page, desk):
     places = {block.elem_id for block in page.blocks.blocks.values() if getattr(block, "elem_id", None)}
-    assert {"main", "examples-part", "results", "form", "scene", "actions"} <= places
-    used = set(re.findall(r"#([a-z-]+)[ .,:{]", look.CSS)) | set(
-        re.findall(r"getElementById\('([^']*)'\)", look.RUN_BEGINS)
-    )
-    assert {name for name in used if not re.fullmatch(r"[0-9a-f]{3}|[0-9a-f]{6}", name)} - places - {
-        "examples-note"
-    } == set()
+    used = set(re.findall(r"#([a-z-]+)[ .,:{)]", templates.CSS))
+    used |= set(re.findall(r"getElementById\('([^']*)'\)", templates.RUN_BEGINS + templates.RUN_ENDS))
+    colours = {name for name in used if re.fullmatch(r"[0-9a-f]{3}|[0-9a-f]{6}", name)}
+    assert used - colours - places <= {"examples-note"}
     hidden = {name: getattr(desk.panels, name).visible for name in ("pick", "picked", "paths")}
-    assert (
-        hidden == {"pick": "hidden", "picked": "hidden", "paths": False}
-        and desk.memory.secret.visible == "hidden"
-    )
-    assert not desk.panels.paths.interactive and desk.panels.paths.file_count == "multiple"
-    assert (desk.panels.add.value, desk.panels.clear.value) == ("Add point", "Clear points")
-    assert desk.panels.pixel.label == "A point by its pixel: x, y" and desk.panels.pixel.max_lines == 1
-    assert (
-        page.blocks.delete_cache == (60, 600) and page.blocks.title == "Depth in metres from two photographs"
-    )
+    assert hidden == {"pick": "hidden", "picked": "hidden", "paths": False}
+    assert desk.secret.visible == "hidden" and not desk.panels.paths.interactive
+    assert page.blocks.delete_cache == (60, 600) and page.blocks.title == "Metric depth from two images"
     assert not page.blocks.analytics_enabled and page.blocks.fill_width
 
 
@@ -210,15 +232,14 @@ def test_texts_stand_out_from_what_is_behind_them(text, background, page):
 def test_fonts_and_colours_of_the_page_are_those_of_the_system_and_of_its_style_sheet(page):
     theme = page.module.THEME
     assert theme._font == ["system-ui", "sans-serif"] and theme._font_mono == ["ui-monospace", "monospace"]
-    assert theme.primary_700 in look.CSS and theme.neutral_600 == theme.body_text_color_subdued
+    assert theme.primary_700 in templates.CSS and theme.neutral_600 == theme.body_text_color_subdued
     assert theme.button_primary_background_fill == theme.button_primary_background_fill_dark
 
 
 def test_clicks_call_what_they_should_with_their_fields(page, desk):
-    form, panels, memory = desk.form, desk.panels, desk.memory
+    form, panels, secret = desk.form, desk.panels, desk.secret
     fields, outputs = list(form.fields.values()), desk.of_result()
-    assert [type(output).__name__ for output in outputs] == ["HTML"] * 10 + ["File", "Textbox", "State"]
-    assert len(set(outputs)) == 13
+    assert [type(output).__name__ for output in outputs] == ["HTML"] * 9 + ["File", "Textbox"]
 
     def check(f, events, inputs, to, **more):
         if events is not None:
@@ -228,174 +249,288 @@ def test_clicks_call_what_they_should_with_their_fields(page, desk):
             assert getattr(f, name) == value, name
 
     quick = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
-    by_button, by_example = page.of("estimate")
-    for f, name in ((by_button, "estimate"), (by_example, "false")):
-        check(
-            f, None, fields, outputs, concurrency_limit=None, show_progress="full", queue=True, api_name=name
-        )
-        assert f.show_progress_on == [panels.status]
-    come, come_by_example = page.of("come")
-    check(come, [(form.run, "click")], [], [panels.status], js=look.RUN_BEGINS, **quick)
-    check(come_by_example, [], [], [panels.status], js=look.RUN_BEGINS, **quick)
-    ends = [f for f in page.fns if f.js == look.RUN_ENDS]
-    assert len(ends) == 2 and all(f.inputs == [memory.secret] and not f.queue for f in ends)
-    (take,) = page.of("take")
-    assert take.outputs == fields and take.fn(SimpleNamespace(index=2)) == form.example(2)
-    check(take, None, [], fields, **quick)
-    check(page.of("stop")[0], [(form.stop, "click")], [], [panels.status], **quick)
+    shows = {"concurrency_limit": None, "show_progress": "full", "queue": True, "trigger_mode": "multiple"}
+    shows |= {"show_progress_on": [desk.progress], "js": templates.RUN_BEGINS, "api_visibility": "private"}
+    (by_button,), (by_example,) = page.of("estimate"), page.of("run_example")
+    on_screen = [*outputs, desk.progress, form.stop]
+    check(by_button, [(form.run, "click")], fields, on_screen, **shows)
+    check(by_example, None, [], [*fields, *on_screen], **shows)
+    (by_client,) = page.of("estimate_at_once")
+    check(by_client, None, fields, outputs, api_name="estimate")
+    ends = [f for f in page.fns if f.js == templates.RUN_ENDS]
+    assert len(ends) == 2 and not any(f.queue for f in ends)
+    (keep,) = [f for f in page.fns if f.js == templates.KEEP_SECRET]
+    check(keep, [(secret, "change")], [secret], [], queue=False)
+    check(page.of("stop")[0], [(form.stop, "click")], [], [], **quick)
     drops = [form.fields[name] for name in ("left", "right", "calib")]
     check(page.of("note_uploads")[0], [(field, "upload") for field in drops], drops, [], **quick)
-    (changed,) = [f for f in page.fns if f.js == look.CHANGED]
+    (changed,) = [f for f in page.fns if f.js == templates.CHANGED]
     check(changed, [(field, event) for field in drops for event in ("upload", "clear")], [], [], queue=False)
-    measured = [memory.pixels, panels.marks_data, panels.headline, panels.picture, panels.readings]
+    measured = [panels.marks_data, panels.headline, panels.readings]
     picked, typed = page.of("add_point")
-    known = [memory.secret, memory.pixels]
-    check(picked, [(panels.pick, "click")], [*known, panels.picked], measured, js=look.PICKED)
+    check(picked, [(panels.pick, "click")], [secret, panels.picked], measured, js=templates.PICKED)
     assert picked.queue and picked.trigger_mode == "multiple" and picked.concurrency_limit == 1
-    check(typed, [(panels.add, "click"), (panels.pixel, "submit")], [*known, panels.pixel], measured, **quick)
-    check(page.of("clear_points")[0], [(panels.clear, "click")], [memory.secret], measured, **quick)
-    check(page.of("open_files")[0], [(panels.tabs, "select")], known, [panels.files], **quick)
-    (back,) = page.of("come_back")
-    check(back, [(page.blocks, "load")], [memory.secret], outputs, js=look.COME_BACK, **quick)
+    check(typed, [(panels.add, "click"), (panels.pixel, "submit")], [secret, panels.pixel], measured, **quick)
+    for name, buttons in (("undo_point", panels.undo), ("clear_points", panels.clear)):
+        assert len(buttons) == 2, "in the 3D view and next to the readings"
+        check(page.of(name)[0], [(button, "click") for button in buttons], [secret], measured, **quick)
+    check(page.of("open_tab")[0], [(panels.tabs, "select")], [secret], [panels.files], **quick)
+    (back,) = page.of("restore")
+    assert back.outputs == [*outputs, form.fields["camera_input"]] and back.js == templates.COME_BACK
     assert len(page.of("leave")) == 1
 
 
-def test_a_run_shows_its_result_and_keeps_it_for_its_tab(run, desk, tmp_path):
-    told = []
-    assert desk.come(asks()) == look.BUSY
-    shown = result(tmp_path)
-    values = run(shown, told=told)
-    secret = values["secret"]
-    assert desk.sessions.keeper.get(secret) is shown and desk.sessions.of("tab").secret == secret
-    assert values["paths"] == [str(tmp_path / "out" / name) for name in ("everything.zip", "depth.npy")]
-    assert is_drawn(values, shown, (), results.files_of(shown)) and values["pixels"] == []
-    assert told == [(0.5, "half")]
-    session = desk.sessions.of("tab")
-    before = session.stop
-    second = run(result(tmp_path, "second"))
-    assert desk.sessions.keeper.get(secret) is None and not (tmp_path / "out").exists(), (
-        "a tab has one result"
+def test_a_run_shows_its_result_before_its_files_and_keeps_it_for_its_tab(desk, jobs, tmp_path):
+    screen, made = Screen(desk), made_result()
+    begun, first, rest, files, *_ = run(desk, jobs, made, screen)
+    assert begun["progress"] == templates.running("what runs") and begun["stop"]["interactive"]
+    assert "Below: the earlier result of Playroom" in begun["status"]
+    assert {"status", "scene_data", "headline", "secret"} <= set(first) and "depth" not in first
+    assert first["progress"] == "" and not first["stop"]["interactive"]
+    assert {"depth", "confidence"} <= set(rest) and rest["files"] == templates.FILES_COMING
+    assert "depth.npy" in files["files"]
+    result = desk.sessions.result(desk.sessions.of("tab"))
+    assert result.shown.depth_m is made.depth_m and result.pixels == []
+    assert is_drawn(screen.shows, result, results.files_of(result))
+    assert screen.shows["paths"] == [str(path) for path in results.files_of(result)]
+    assert desk.sessions.store.get(screen.shows["secret"]) is result and jobs.reported == [(0.5, "half")]
+    before = result.shown.folder
+    run(desk, jobs, made_result(name="second", confidence=None), screen)
+    assert not before.exists(), "a tab has one result"
+    assert screen.shows["confidence"] == "This preset estimates no confidence."
+
+
+@pytest.mark.parametrize(
+    ("tab", "panel"),
+    [("Depth", "depth"), ("Confidence", "confidence"), ("Measure", "scene_data"), ("x", "scene_data")],
+)
+def test_the_open_tab_is_drawn_first(page, tab, panel):
+    first, rest = page.module.drawn(Result(made_result()), tab)
+    assert panel in first and panel not in rest and "status" in first and "headline" in first
+    everything = first | rest
+    assert {"depth", "legend", "confidence", "scene_data", "marks_data", "readings", "files"} <= set(
+        everything
     )
-    assert session.secret == second["secret"] != secret and session.stop is not before
-    bare = run(made_result(confidence=None, folder=None))
-    assert bare["confidence"] == "This preset gives no confidence." and bare["files"] == look.NO_FILES
 
 
-def test_a_run_that_fails_or_is_stopped_says_so_and_shows_nothing(run, desk, tmp_path, capsys):
-    for outcome, status in (
-        (
-            InputError("K is bad; give --fx."),
-            look.failed("the camera's focal length and centre is bad; give fx."),
-        ),
-        (UnknownFormatError("x"), look.failed(look.UNKNOWN_CALIBRATION, look.LINK_TO_FORMATS)),
-        (Stopped(), look.STOPPED),
-        (ZeroDivisionError("1/0"), look.failed("This is a defect, not your input: ZeroDivisionError.")),
-    ):
-        values = run(outcome)
-        assert values["status"] == status
-        assert values["secret"] == "" and values["paths"] is None and values["pixels"] == []
-        empty = ("scene_data", "marks_data", "depth", "legend", "picture", "confidence")
-        assert all(values[name] == "" for name in empty)
-        assert values["headline"] == look.headline("", "No result yet.") and values["files"] == look.WAITING
-        assert values["readings"] == look.HOW_TO_MEASURE
-        said = capsys.readouterr()
-        assert ("Traceback" in said.err and "1/0" in said.err) == isinstance(outcome, ZeroDivisionError)
-        assert said.out == ""
-    assert not desk.sessions.keeper._shown and not desk.sessions.of("tab").runs
-    shown = result(tmp_path)
-    values = run(shown, during=lambda: desk.stop(asks()))
-    assert values["status"] == look.STOPPED and not shown.folder.exists(), "its files go"
-    assert not desk.sessions.of("tab").stop.is_set(), "the next run begins"
-    assert desk.stop(asks("b")) == look.STOPPED and desk.sessions.of("b").stop.is_set()
+def coded(code: str) -> InputError:
+    with pytest.raises(InputError) as raised:
+        bad_value("K", "x", "y", code=code)
+    return raised.value
 
 
-def test_who_waits_is_told_how_many_are_before(run, desk, monkeypatch):
-    told = []
-    monkeypatch.setattr(keeping.time, "sleep", lambda _: None)
-    others = [keeping.Session(), keeping.Session()]
-    desk.turns._waiting[:] = others
-    desk.turns._turn.acquire()
+@pytest.mark.parametrize(
+    ("filled", "outcome", "notice"),
+    [
+        ((1, 2), coded("estimate.rotation"), ERRORS_ON_PAGE["estimate.rotation"][0]),
+        ((1, 2), UnknownFormatError("x"), templates.LINK_TO_FORMATS),
+        ((1, 2), Stopped(), templates.STOPPED),
+        ((1, 2), ZeroDivisionError("1/0"), "Internal error (ZeroDivisionError)."),
+        ((PageError("Enter fx as well."),), None, "Enter fx as well."),
+    ],
+)
+def test_a_run_that_fails_or_is_stopped_keeps_the_earlier_result_named(
+    filled, outcome, notice, desk, jobs, capsys
+):
+    screen = Screen(desk)
+    run(desk, jobs, made_result(name="the first pair"), screen)
+    screen.click(5, 7)
+    kept = dict(screen.shows)
+    run(desk, jobs, outcome, screen, filled=filled)
+    status = screen.shows["status"]
+    assert notice in status and "Below: the earlier result of the first pair" in status
+    assert {**screen.shows, "status": ""} == {
+        **kept,
+        "status": "",
+        "progress": "",
+        "stop": screen.shows["stop"],
+    }
+    assert not screen.shows["stop"]["interactive"]
+    reported = capsys.readouterr()
+    assert ("Traceback" in reported.err) == isinstance(outcome, ZeroDivisionError) and reported.out == ""
+    screen.click(9, 7)
+    assert [*Measurement.of(desk.sessions.result(desk.sessions.of("tab"))).readings][1].pixel == (9, 7)
 
-    def tell(*now):
-        told.append(now)
+
+def test_a_stop_in_the_last_stage_discards_the_new_result(desk, jobs):
+    screen = Screen(desk)
+    run(desk, jobs, made_result(name="kept"), screen)
+    run(desk, jobs, made_result(name="stopped"), screen, during=lambda: desk.stop(asks()))
+    assert "earlier result of kept" in screen.shows["status"] and "stopped" not in screen.shows["status"]
+    run(desk, jobs, made_result(name="next"), screen)
+    assert "next" in screen.shows["status"] and "earlier" not in screen.shows["status"]
+
+
+def test_an_expired_result_is_gone_everywhere(desk, jobs):
+    screen = Screen(desk)
+    run(desk, jobs, made_result(), screen)
+    desk.sessions.store.drop(screen.shows["secret"])
+    assert templates.EXPIRED in screen.click(5, 7)["readings"]
+    run(desk, jobs, coded("memory"), screen)
+    empty = ("scene_data", "marks_data", "depth", "legend", "confidence")
+    assert all(screen.shows[name] == "" for name in empty) and screen.shows["files"] == templates.WAITING
+    assert ERRORS_ON_PAGE["memory"][0] in screen.shows["status"] and screen.shows["paths"] is None
+    assert templates.EXPIRED in screen.click(5, 7)["readings"], "and not the points of the first result"
+
+
+def test_a_later_click_ends_the_earlier_run_without_a_message(desk, jobs):
+    """The second run begins while the first one computes, as with two quick clicks."""
+    screen, second = Screen(desk), []
+
+    def click_again():
+        jobs.during = lambda: None
+        jobs.outcome = made_result(name="first")
+        second.append(desk.estimate(asks(), lambda *_: None, 1, 2))
+        screen.apply(next(second[0]))
+
+    updates = run(desk, jobs, made_result(name="first"), screen, during=click_again)
+    assert [set(update) for update in updates[1:]] == [set()], "the first run shows nothing any more"
+    assert screen.shows["progress"] == templates.running("what runs")
+    jobs.outcome = made_result(name="second")
+    for update in second[0]:
+        screen.apply(update)
+    assert "second" in screen.shows["status"] and screen.shows["progress"] == ""
+    assert is_drawn(screen.shows, desk.sessions.result(desk.sessions.of("tab")))
+
+
+def test_a_waiting_visitor_sees_how_many_runs_are_ahead(desk, jobs, monkeypatch):
+    reported = []
+    monkeypatch.setattr(sessions.time, "sleep", lambda _: None)
+    others = [sessions.Run(), sessions.Run()]
+    desk.queue._waiting[:] = others
+    desk.queue._lock.acquire()
+
+    def notify(*now):
+        reported.append(now)
         if others:
-            desk.turns._waiting.remove(others.pop())
+            desk.queue._waiting.remove(others.pop())
         else:
-            desk.sessions.of("tab").stop.set()
+            desk.stop(asks())
 
+    screen = Screen(desk)
     try:
-        values = named(desk, desk.estimate(asks(), tell, *desk.form.example(0)))
+        for update in desk.estimate(asks(), notify, 1, 2):
+            screen.apply(update)
     finally:
-        desk.turns._turn.release()
-        desk.turns._waiting.clear()
-    assert values["status"] == look.STOPPED
-    assert told[0] == (0.0, "Waiting: 2 runs are before yours") and told[-1] == (
-        0.0,
-        "Waiting: 1 run is before yours",
-    )
+        desk.queue._lock.release()
+        desk.queue._waiting.clear()
+    assert templates.STOPPED in screen.shows["status"]
+    assert reported[0] == (0.0, "Queued: 2 runs are ahead of yours")
+    assert reported[-1] == (0.0, "Queued: 1 run is ahead of yours")
 
 
-def test_a_reloaded_tab_gets_its_result_again_and_longer(run, desk, tmp_path, monkeypatch):
-    shown = result(tmp_path)
-    secret = run(shown)["secret"]
-    seconds = []
-    monkeypatch.setattr(desk.sessions.keeper, "end_in", lambda *given: seconds.append(given))
-    values = named(desk, desk.come_back(asks("again"), secret))
+def test_an_api_client_gets_the_result_with_its_files_at_once(desk, jobs):
+    jobs.outcome = made_result()
+    values = named(desk, desk.estimate_at_once(asks(), lambda *_: None, 1, 2))
+    assert set(values) == {name for name in named(desk, dict.fromkeys(desk.of_result(), 1))}
+    assert is_drawn(values, desk.sessions.result(desk.sessions.of("tab"))) and "depth.npy" in values["files"]
+
+
+def test_a_reloaded_tab_gets_its_result_again_with_its_points(desk, jobs, monkeypatch):
+    screen = Screen(desk)
+    run(desk, jobs, made_result(), screen)
+    screen.click(5, 7)
+    seconds, secret = [], screen.shows["secret"]
+    monkeypatch.setattr(desk.sessions.store, "end_in", lambda *given: seconds.append(given))
+    values = named(desk, desk.restore(asks("again"), secret, False))
     assert values["secret"] == secret == desk.sessions.of("again").secret and seconds == [(secret, 600)]
-    assert is_drawn(values, shown, (), results.files_of(shown))
-    assert (
-        named(desk, desk.come_back(asks("b"), "gone")) == {"secret": ""}
-        and desk.sessions.of("b").secret == ""
-    )
-    assert (
-        desk.shown_by("") is desk.first.shown
-        and desk.shown_by(secret) is shown
-        and desk.shown_by("gone") is None
-    )
+    result = desk.sessions.store.get(secret)
+    assert result.pixels == [(5, 7)] and is_drawn(values, result, results.files_of(result))
+    assert named(desk, desk.restore(asks("b"), "gone", False)) == {"secret": ""}
+    assert desk.sessions.of("b").secret == ""
+    phone = named(desk, desk.restore(asks("phone"), "", True))
+    assert phone == {"secret": "", "field camera_input": "images"}, "no calibration is at hand"
 
 
-def test_points_are_added_one_by_one_and_the_last_26_stay(run, desk, tmp_path):
-    shown = result(tmp_path)
-    secret = run(shown)["secret"]
-    values = named(desk, desk.add_point(secret, [(3, 4)], "x 7, y 9 and 11"))
-    assert values["pixels"] == [(3, 4), (7, 9)]
-    found = results.measurement(shown, [(3, 4), (7, 9)])
-    assert values["readings"] == found.words and values["headline"] == found.headline
-    assert set(values) == {"pixels", "marks_data", "headline", "picture", "readings"}
-    many = [(n, 2) for n in range(26)]
-    assert named(desk, desk.add_point(secret, many, "30 5"))["pixels"] == [*many[1:], (30, 5)]
-    assert named(desk, desk.add_point(secret, [], "7 9"))["pixels"] == [(7, 9)]
-    for typed in ("", None, "7", "seven, nine"):
-        assert named(desk, desk.add_point(secret, [], typed)) == {"readings": "Type two whole numbers: x, y."}
-    shown.depth_m[9, 7] = 0
-    said = named(desk, desk.add_point(secret, [], "7 9"))
-    assert list(said) == ["readings"] and "pixel must be one with a depth" in said["readings"]
-    assert named(desk, desk.clear_points(secret))["pixels"] == []
-    gone = {"readings": look.failed("This result is no longer here. Estimate again.")}
-    assert named(desk, desk.measure("gone", [(3, 4)])) == gone
-    assert (
-        named(desk, desk.measure("", [(3, 4)]))["readings"]
-        == results.measurement(desk.first.shown, [(3, 4)]).words
-    )
+def test_points_belong_to_the_result_that_was_clicked(desk, jobs):
+    screen = Screen(desk)
+    first = desk.sessions.result(desk.sessions.of("tab"))
+    screen.click(50, 60)
+    assert first.pixels[-1] == (50, 60) and len(first.pixels) == 3
+    assert len(desk.sessions.result(desk.sessions.of("other")).pixels) == 2, "another visitor's are untouched"
+    run(desk, jobs, made_result(), screen)
+    update = desk.add_point(asks(), "", "7, 9")
+    assert named(desk, update) == {}, "a late click on the earlier result"
+    result = desk.sessions.result(desk.sessions.of("tab"))
+    assert result.pixels == [] and len(first.pixels) == 3
+    for n in range(30):
+        screen.click(n, 2)
+    assert result.pixels == [(n, 2) for n in range(30)], "more than there are letters"
+    assert "<b>AD</b>" in screen.shows["readings"]
+    screen.apply(desk.undo_point(asks(), screen.shows["secret"]))
+    assert result.pixels[-1] == (28, 2) and len(result.pixels) == 29
+    screen.apply(desk.clear_points(asks(), screen.shows["secret"]))
+    screen.apply(desk.undo_point(asks(), screen.shows["secret"]))
+    assert result.pixels == [] and screen.shows["readings"] == templates.HOW_TO_MEASURE
 
 
-def test_files_are_listed_when_their_tab_is_opened(run, desk, tmp_path):
-    shown = result(tmp_path)
-    secret = run(shown)["secret"]
-    html = desk.open_files(secret, [(3, 4)], SimpleNamespace(value="Files"))
-    assert html == look.files(results.files_of(shown, [(3, 4)])) and "measurements.csv" in html
+def test_a_session_that_was_lost_finds_its_result_again(desk, jobs):
+    screen = Screen(desk)
+    run(desk, jobs, made_result(), screen)
+    desk.sessions._of.clear()  # the connection was interrupted
+    screen.click(5, 7)
+    assert desk.sessions.store.get(screen.shows["secret"]).pixels == [(5, 7)]
+
+
+@pytest.mark.parametrize(
+    ("typed", "pixel"),
+    [
+        ("320, 240", (320, 240)),
+        ("1.5, 2.5", (2, 3)),
+        ("(7;9)", (7, 9)),
+        ("1.4 2.6", (1, 3)),
+        ("-5, 3", (-5, 3)),
+    ],
+)
+def test_typed_points_are_numbers(typed, pixel, page):
+    assert page.module.pixel_of(typed) == pixel
+
+
+@pytest.mark.parametrize("typed", ["", None, "7", "seven, nine", "-5", "1, 2, 3", "1e999, 2", "nan, 1"])
+def test_what_are_not_two_numbers_is_explained(typed, page):
+    with pytest.raises(PageError, match="Enter two numbers, x and y, such as 320, 240"):
+        page.module.pixel_of(typed)
+
+
+def test_a_point_that_cannot_be_measured_leaves_the_others(desk, jobs):
+    screen, made = Screen(desk), made_result()
+    made.depth_m[9, 7] = 0
+    run(desk, jobs, made, screen)
+    screen.click(5, 7)
+    kept = screen.shows["marks_data"]
+    for typed, message in (
+        ("7, 9", "has no depth"),
+        ("-5, 3", "x goes from 0 to 43"),
+        ("-5", "Enter two numbers"),
+    ):
+        screen.apply(desk.add_point(asks(), screen.shows["secret"], typed))
+        assert message in screen.shows["readings"] and "<b>A</b>" in screen.shows["readings"]
+        assert message in screen.shows["headline"] and screen.shows["marks_data"] == kept
+
+
+def test_the_ends_of_a_known_length_are_measured_in_the_result(page):
+    shown = made_result()
+    request = SimpleNamespace(pixels=[(3, 4), (20, 9)])
+    assert page.module._measurable(shown, request) == [(3, 4), (20, 9)]
+    shown.depth_m[9, 20] = 0
+    assert page.module._measurable(shown, request) == []
+
+
+def test_measurements_are_written_when_the_files_are_opened(desk, jobs):
+    screen = Screen(desk)
+    run(desk, jobs, made_result(), screen)
+    screen.click(3, 4)
+    secret = screen.shows["secret"]
+    html = desk.open_tab(asks(), secret, SimpleNamespace(value="Files"))
+    assert "measurements.csv" in html and desk.sessions.of("tab").tab == "Files"
     skipped = gr.skip()
-    assert desk.open_files(secret, [(3, 4)], SimpleNamespace(value="Depth")) == skipped
-    assert desk.open_files("gone", [(3, 4)], SimpleNamespace(value="Files")) == skipped
-    assert (
-        "measurements.csv" in html
-        and desk.open_files("", [], SimpleNamespace(value="Files")) == look.NO_FILES
-    )
+    assert desk.open_tab(asks(), secret, SimpleNamespace(value="Depth")) == skipped
+    assert desk.sessions.of("tab").tab == "Depth"
+    assert desk.open_tab(asks(), "gone", SimpleNamespace(value="Files")) == skipped
+    assert desk.open_tab(asks("new"), "", SimpleNamespace(value="Files")) == templates.NO_FILES
 
 
 def test_uploads_are_those_of_the_visitor_and_no_example(page, desk, tmp_path):
-    from geodiff_plugin.app.form import EXAMPLES
-
     def upload(name, content=b"mine"):
         path = tmp_path / name / "file.png"
         path.parent.mkdir(parents=True)
@@ -417,6 +552,252 @@ def test_uploads_are_those_of_the_visitor_and_no_example(page, desk, tmp_path):
     assert "tab" not in desk.sessions._of
 
 
-def test_what_went_wrong_is_in_words_of_a_visitor(page, capsys):
-    assert page.module._failed(InputError("LEFT is bad")) == look.failed("the left photograph is bad")
-    assert capsys.readouterr().err == ""
+def test_a_message_has_no_folder_of_the_server(page, tmp_path):
+    options = DepthOptions(left=tmp_path / "left.png", right=tmp_path / "right.png")
+    html = page.module._failed(InputError(f"LEFT is bad; got {tmp_path}/left.png."), Request(options, "x"))
+    assert "got left.png." in html and str(tmp_path) not in html
+
+
+class Visit(RuleBasedStateMachine):
+    """A visitor who clicks, stops and measures in any order, while runs begin, end and fail.
+
+    The pair in the banner, the result in every panel and the measurements always belong together.
+    """
+
+    desk = jobs = None
+
+    def __init__(self):
+        super().__init__()
+        self.desk.sessions._of.clear()
+        self.screen, self.running, self.count = Screen(self.desk), [], 0
+        first = self.desk.sessions.result(self.desk.sessions.of("tab"))
+        for html in drawn_of(self.desk, first):
+            self.screen.shows |= html
+        self.last_wanted = self.expected = first.shown.name
+
+    def result(self) -> Result:
+        return self.desk.sessions.result(self.desk.sessions.of("tab"))
+
+    @rule(fails=st.booleans(), missing=st.booleans())
+    def click_run(self, fails, missing):
+        self.count += 1
+        name = f"pair {self.count}"
+        filled = (PageError("A field is missing."),) if missing else (name, fails)
+        steps = self.desk.estimate(asks(), lambda *_: None, *filled)
+        self.screen.apply(next(steps))
+        self.running.append((steps, name, fails))
+
+    @rule()
+    def let_the_oldest_run_end(self):
+        if self.running:
+            steps, name, fails = self.running.pop(0)
+            self.jobs.outcome = coded("memory") if fails else made_result(name=name)
+            for update in steps:
+                self.screen.apply(update)
+
+    @rule()
+    def stop(self):
+        self.desk.stop(asks())
+
+    @rule(x=st.integers(-2, 45), y=st.integers(-2, 31))
+    def measure(self, x, y):
+        self.screen.click(x, y)
+
+    @rule()
+    def undo(self):
+        self.screen.apply(self.desk.undo_point(asks(), self.screen.shows["secret"]))
+
+    @rule(tab=st.sampled_from(("3D", "Depth", "Files")))
+    def open_tab(self, tab):
+        html = self.desk.open_tab(asks(), self.screen.shows["secret"], SimpleNamespace(value=tab))
+        self.screen.apply({self.desk.panels.files: html})
+
+    @rule()
+    def reload(self):
+        if not self.running:
+            secret, self.screen = self.screen.shows["secret"], Screen(self.desk)
+            first = self.desk.sessions.of("new").first
+            for html in drawn_of(self.desk, first):
+                self.screen.shows |= html
+            self.desk.sessions._of.pop("tab")
+            self.screen.apply(self.desk.restore(asks(), secret, False))
+
+    @invariant()
+    def everything_belongs_together(self):
+        result, shows = self.result(), self.screen.shows
+        found = Measurement.of(result)
+        assert f'<span class="pair-name">{result.shown.name}' in shows["status"]
+        assert shows["marks_data"] == templates.hidden(found.marks())
+        assert found.html() in shows["readings"] and shows["scene_data"] == self.scene(result)
+        assert shows["secret"] == self.desk.sessions.of("tab").secret
+        idle = self.desk.sessions.of("tab").run is None
+        assert ("Below: the earlier result of" in shows["status"]) or idle
+        assert (shows.get("progress", "") == "") == idle
+        if "stop" in shows:
+            assert shows["stop"]["interactive"] == (not idle)
+
+    def scene(self, result):
+        """The data of the 3D view, which takes long to make, once per result."""
+        if getattr(result, "scene", None) is None:
+            result.scene = templates.hidden(results.scene_data(result.shown))
+        return result.scene
+
+
+def drawn_of(desk, result):
+    from geodiff_plugin.app.page import drawn
+
+    return drawn(result)
+
+
+@pytest.mark.parametrize("seed", [0])
+def test_any_order_of_clicks_stops_and_failures_leaves_pair_result_and_points_together(
+    seed, desk, jobs, page
+):
+    small = made_result(name="Playroom", precomputed=True)
+    desk.sessions._first = lambda: Result(small, [(1, 2), (3, 4)])
+    Visit.desk, Visit.jobs = desk, jobs
+    try:
+        run_state_machine_as_test(
+            Visit, settings=hypothesis_settings(max_examples=40, stateful_step_count=25, deadline=None)
+        )
+    finally:
+        first = page.module.read_first_result()
+        desk.sessions._first = lambda: Result(first.shown, list(first.pixels))
+
+
+@pytest.fixture(scope="module")
+def images(textured_plane, tmp_path_factory):
+    """Paths of the left and the right one, in folders of their own as the page keeps them."""
+    paths = [str(tmp_path_factory.mktemp(side) / f"{side}.png") for side in ("left", "right")]
+    for path, image in zip(paths, (textured_plane.left, textured_plane.right), strict=True):
+        Image.fromarray(image).save(path)
+    return paths
+
+
+@pytest.mark.filterwarnings("ignore:.*has no unit")
+def test_a_calibration_without_a_unit_needs_the_distance(images, priors, tmp_path):
+    frames = [
+        {"file_path": f"{side}.png", "transform_matrix": (np.eye(4) + x * np.eye(4, k=3)).tolist()}
+        for side, x in (("left", 0), ("right", 0.5))
+    ]
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "frames": frames}))
+    request = request_of(*images, CameraFields("file", (str(path),)), prior="tiny")
+    with pytest.raises(PageError, match="calibration has no unit. Enter the distance between the cameras"):
+        run_of_app(request, priors)
+
+
+@pytest.fixture(scope="module")
+def priors(make_pipeline):
+    offered = Priors(("tiny",), torch.device("cpu"))
+    offered._loaded["tiny"] = enable_geometry_guidance(make_pipeline())
+    return offered
+
+
+def asked(images, **more) -> Request:
+    cameras = CameraFields("numbers", lens={"fx": 60.0}, baseline=0.12)
+    return request_of(*images, cameras, **({"prior": "tiny", "steps": 1} | more))
+
+
+def run_of_app(request, priors):
+    return run_job(request, priors, threading.Event(), lambda *_: None)
+
+
+@pytest.fixture(scope="module")
+def result_of_app(priors, images, tmp_path_factory):
+    request, reported = asked(images, ensemble=2), []
+    job = run_job(request, priors, threading.Event(), lambda *now: reported.append(now))
+    assert reported == sorted(reported) and 0 <= reported[0][0] <= reported[-1][0] <= 1
+    assert any("Guided step" in name for _, name in reported)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tempfile.tempdir", str(tmp_path_factory.mktemp("results")))
+        folder = clean_report(write_job(job))
+    return replace(shown_of(job, request.name), folder=folder)
+
+
+def test_a_job_and_its_files(result_of_app):
+    assert result_of_app.depth_m.shape == result_of_app.sigma_m.shape == (48, 64)
+    paths = results.files_of(Result(result_of_app))
+    names, folder = [path.name for path in paths], paths[0].parent
+    assert names[:3] == ["result.zip", "depth_mm.png", "depth.png"] and "confidence.npy" in names
+    assert set(names) <= set(results.PURPOSES), "every file has a purpose"
+    assert sorted(ZipFile(paths[0]).namelist()) == sorted(n for n in names[1:] if not n.endswith(".npy"))
+    np.testing.assert_array_equal(np.load(folder / "depth.npy"), result_of_app.depth_m)
+    report = json.loads((folder / "report.json").read_text())
+    assert report["inputs"]["E"][0][3] == pytest.approx(0.12) and report["arguments"]["left"] == "left.png"
+    assert report["arguments"]["ensemble"] == 2 and any(
+        "cx is assumed" in finding["text"] for finding in report["findings"]
+    )
+    assert report["verdict"]["status"] == result_of_app.trust.status
+    assert not {"signs", "indicators"} & set(report["verdict"])
+    pixels = [(5, 5), (50, 40), (20, 20)]
+    with ZipFile(results.files_of(Result(result_of_app, pixels))[0]) as archive:
+        header, *rows = archive.read("measurements.csv").decode().splitlines()
+    assert header.startswith("name,x_px") and rows[0].startswith("A,5,5,")
+    assert [row.split(",")[0] for row in rows] == ["A", "B", "C", "A to B"]
+    results.files_of(Result(result_of_app))
+
+
+def test_a_stored_result_reads_back_as_it_was(result_of_app, images, tmp_path):
+    save(tmp_path / "first.npz", result_of_app, [(5, 5), (50, 40)])
+    again, pixels = load(tmp_path / "first.npz", images[0], "an example")
+    assert pixels == [(5, 5), (50, 40)] and again.trust == result_of_app.trust
+    assert [m.code for m in again.messages] == [m.code for m in result_of_app.messages]
+    np.testing.assert_allclose(again.depth_m, result_of_app.depth_m, atol=5e-4)
+    np.testing.assert_array_equal(again.image, result_of_app.image)
+    np.testing.assert_allclose(again.views[1].E, result_of_app.views[1].E)
+
+
+def test_a_stop_ends_a_job_between_steps(priors, images):
+    stop = threading.Event()
+    with pytest.raises(Stopped):
+        run_job(asked(images, steps=3), priors, stop, lambda _, name: "Guided" in name and stop.set())
+    assert "step" not in vars(priors.get("tiny").scheduler)  # nothing of the call is left behind
+
+
+def test_examples_are_whole_and_belong_to_no_visitor(page, monkeypatch):
+    form = page.desk.form
+    for number, example in enumerate(EXAMPLES):
+        folder = example.folder
+        options = form.request(tuple(form.example(number))).options
+        assert options.baseline is None and not options.estimate_pose
+        monkeypatch.setattr("tempfile.tempdir", str(folder.parent))  # gradio's copies lie there
+        given = [*options.image_files().values(), *options.calib]
+        assert not page.module._uploads([str(path) for path in given]), "no visitor takes an example along"
+        rig = read_calibration(options.calib)
+        for path in options.image_files().values():
+            image, notes = read_image(path, "image")
+            assert image.shape[1::-1] == rig.size_left and notes == [] and path.parent == folder
+
+
+def test_the_page_hands_on_images_as_they_are(tmp_path):
+    from gradio.data_classes import ImageData
+
+    from geodiff_plugin.app.form import image_field
+
+    values = np.linspace(0, 65535, 48 * 64).reshape(48, 64).astype(np.uint16)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 65
+    deep, grey = tmp_path / "deep.png", tmp_path / "grey.jpg"
+    Image.fromarray(values).save(deep)
+    Image.fromarray((values >> 8).astype(np.uint8)).save(grey, exif=exif)
+    field = image_field("Left image", "left")
+    given = [field.preprocess(ImageData(path=str(path), orig_name=path.name)) for path in (deep, grey)]
+    np.testing.assert_allclose(read_image(given[0])[0][..., 0], values / 65535, atol=1e-6)
+    with Image.open(given[1]) as image:
+        assert image.getexif().get_ifd(0x8769)[0xA405] == 65
+    assert read_image(given[1])[0].shape == (64, 48, 3), "turned upright"
+
+
+def test_an_unknown_calibration_is_one_short_sentence_with_a_link(page, tmp_path):
+    from geodiff_plugin.formats import CALIBRATION_FORMATS
+
+    (tmp_path / "notes.txt").write_text("no calibration")
+    with pytest.raises(ValueError) as rejected:
+        read_calibration(tmp_path / "notes.txt")
+    message = page.module._failed(rejected.value)
+    assert len(re.sub("<[^>]*>", "", message)) < 120
+    target = re.search('href="#([^"]*)"', message)[1]
+    listed = templates.formats(entry.summary for entry in CALIBRATION_FORMATS.values())
+    assert f'id="{target}"' in listed and "OAK-D JSON" in listed

@@ -1,4 +1,4 @@
-"""What the result panels show, recomputed from the maps: pictures, 3D view, legends, readings and files."""
+"""What the result panels show, recomputed from the maps: images, 3D view, legends, readings and files."""
 
 import csv
 import io
@@ -14,31 +14,33 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin.app import look, results
+from geodiff_plugin.app import results, templates
+from geodiff_plugin.app.messages import PageError
+from geodiff_plugin.app.results import Measurement
+from geodiff_plugin.app.sessions import Result
+from geodiff_plugin.cameras import PosedCamera
 from geodiff_plugin.formats.clouds import camera_pyramid
-from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
+from geodiff_plugin.plotting import colour_depth, colour_fraction, depth_range, ticks
 from geodiff_plugin.result.readings import Reading, distance_m, metres
 from tests.unit.app.made_result import H, K, W, made_result
 
 PIXELS = [(5, 7), (40, 20), (11, 25), (30, 3), (22, 15)]
 
 
-def test_pictures_on_the_page_are_no_larger_than_they_may_be(monkeypatch):
+def test_images_on_the_page_are_no_larger_than_they_may_be(monkeypatch):
     shown = made_result()
-    assert results.scale_of(shown) == 1
-    np.testing.assert_array_equal(results.picture(shown, "photograph"), shown.photograph)
-    np.testing.assert_array_equal(results.picture(shown, "depth"), colour_depth(shown.depth_m))
-    np.testing.assert_array_equal(results.picture(shown, "confidence"), colour_share(shown.confidence))
-    assert results.picture(replace(shown, confidence=None), "confidence") is None
-    monkeypatch.setattr(results, "LARGEST_SIDE", 33)
-    assert results.scale_of(shown) == 0.75
-    for name in ("photograph", "depth", "confidence"):
-        small = results.picture(shown, name)
+    np.testing.assert_array_equal(results.map_image(shown, "image"), shown.image)
+    np.testing.assert_array_equal(results.map_image(shown, "depth"), colour_depth(shown.depth_m))
+    np.testing.assert_array_equal(results.map_image(shown, "confidence"), colour_fraction(shown.confidence))
+    assert results.map_image(replace(shown, confidence=None), "confidence") is None
+    monkeypatch.setattr(results, "MAX_IMAGE_SIDE", 33)
+    for name in ("image", "depth", "confidence"):
+        small = results.map_image(shown, name)
         assert small.shape == (22, 33, 3)
-    full = Image.fromarray(shown.photograph).resize((33, 22), Image.Resampling.LANCZOS)
-    np.testing.assert_array_equal(results.picture(shown, "photograph"), np.asarray(full))
-    tall = replace(shown, depth_m=shown.depth_m.T, photograph=shown.photograph.transpose(1, 0, 2))
-    assert results.picture(tall, "photograph").shape == (33, 22, 3)
+    full = Image.fromarray(shown.image).resize((33, 22), Image.Resampling.LANCZOS)
+    np.testing.assert_array_equal(results.map_image(shown, "image"), np.asarray(full))
+    tall = replace(shown, depth_m=shown.depth_m.T, image=shown.image.transpose(1, 0, 2))
+    assert results.map_image(tall, "image").shape == (33, 22, 3)
 
 
 def from_url(url: str) -> np.ndarray:
@@ -48,29 +50,51 @@ def from_url(url: str) -> np.ndarray:
         return np.asarray(image)
 
 
-def test_a_picture_is_its_own_address():
-    picture = made_result().photograph
-    assert np.abs(from_url(results.data_url(picture)).astype(int) - picture).mean() < 4
+def test_an_image_is_its_own_address():
+    rgb = made_result().image
+    assert np.abs(from_url(results.data_url(rgb)).astype(int) - rgb).mean() < 4
 
 
-@pytest.mark.parametrize("pixel", [(5, 7), (-3, 40), (90, -1), (43, 29), (44, 30)])
-def test_a_pixel_outside_counts_as_the_nearest_inside(pixel):
+def test_a_reading_is_the_maps_at_its_pixel():
     shown = made_result()
-    x, y = np.clip(pixel, 0, (W - 1, H - 1))
-    at = results.reading(shown, pixel)
-    z = float(shown.depth_m[y, x])
-    assert at.pixel == (x, y)
-    np.testing.assert_allclose(at.point_m, (z * (x - 20.5) / 50, z * (y - 13.25) / 46, z))
-    assert at.confidence == shown.confidence[y, x]
+    at = shown.reading((5, 7))
+    z = float(shown.depth_m[7, 5])
+    assert at.pixel == (5, 7) and at.confidence == shown.confidence[7, 5]
+    np.testing.assert_allclose(at.point_m, (z * (5 - 20.5) / 50, z * (7 - 13.25) / 46, z))
     alone = replace(shown, confidence=None)
-    assert results.reading(alone, pixel).spread_m == pytest.approx(1.4826 * shown.uncertainty_m[y, x])
-    assert results.reading(replace(alone, uncertainty_m=None), pixel).spread is None
+    assert alone.reading((5, 7)).spread_m == pytest.approx(shown.sigma_m[7, 5])
+    assert replace(alone, sigma_m=None).reading((5, 7)).spread is None
+
+
+@pytest.mark.parametrize("pixel", [(-1, 4), (W, 4), (4, -1), (4, H), (10**9, 3)])
+def test_a_pixel_outside_is_explained_by_the_size_of_the_image(pixel):
+    with pytest.raises(
+        PageError, match=f"outside of the image: x goes from 0 to {W - 1}, y from 0 to {H - 1}"
+    ):
+        results.check_pixel(made_result(), pixel)
+    for corner in ((0, 0), (W - 1, H - 1)):
+        results.check_pixel(made_result(), corner)
+
+
+@pytest.mark.parametrize("depth", [0.0, -1.0, np.nan, np.inf])
+def test_a_pixel_without_depth_is_explained(depth):
+    shown = made_result()
+    shown.depth_m[9, 7] = depth
+    with pytest.raises(PageError, match=r"\(7, 9\) has no depth"):
+        results.check_pixel(shown, (7, 9))
+
+
+def test_names_of_points_go_on_after_z():
+    names = [results.point_name(number) for number in range(26 + 26 * 26 + 1)]
+    assert names[:3] == ["A", "B", "C"] and names[25:29] == ["Z", "AA", "AB", "AC"]
+    assert names[26 + 25] == "AZ" and names[26 + 26] == "BA" and names[-2:] == ["ZZ", "AAA"]
+    assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
 def test_the_3d_view_gets_a_thinned_grid_with_its_cameras(stride, monkeypatch):
     most = {1: H * W, 2: H * W - 1, 3: H * W // 4 - 1}[stride]
-    monkeypatch.setattr(results, "MOST_POINTS_SHOWN", most)
+    monkeypatch.setattr(results, "MAX_VIEW_POINTS", most)
     shown = made_result()
     shown.depth_m[9, 12], shown.depth_m[18, 24] = np.nan, 99.0
     data = json.loads(results.scene_data(shown))
@@ -89,11 +113,11 @@ def test_the_3d_view_gets_a_thinned_grid_with_its_cameras(stride, monkeypatch):
     assert z.max() == pytest.approx(65535 * data["unit"]), "the farthest uses all 16 bits"
     sure = np.frombuffer(raw, np.uint8, offset=2 * count).reshape(z.shape)
     np.testing.assert_allclose(sure / 255, shown.confidence[::stride, ::stride], atol=0.5 / 255 + 1e-6)
-    assert from_url(data["photograph"]).shape == shown.photograph.shape
+    assert from_url(data["image"]).shape == shown.image.shape
     length_m = 0.08 * np.median(expected[expected > 0])
     colours = ((1, 1, 1), (1, 170 / 255, 0))
     for drawn, view, colour in zip(data["cameras"], shown.views, colours, strict=True):
-        corners = camera_pyramid(view.K, view.E, view.size, length_m) * (1, -1, -1)
+        corners = camera_pyramid(view, length_m) * (1, -1, -1)
         edges = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
         np.testing.assert_allclose(drawn["edges"], [corners[i] for edge in edges for i in edge], atol=1e-4)
         np.testing.assert_allclose(drawn["colour"], colour)
@@ -105,17 +129,23 @@ def test_a_result_without_any_depth_has_a_3d_view_of_its_cameras():
     shown = replace(made_result(), depth_m=np.zeros((H, W), np.float32))
     data = json.loads(results.scene_data(shown))
     assert data["unit"] == 1e-6 and not any(zlib.decompress(b64decode(data["maps"]))[: 2 * H * W])
-    corners = camera_pyramid(K, np.eye(4), (W, H), 1.0)
+    corners = camera_pyramid(PosedCamera(K, (W, H), E=np.eye(4)), 1.0)
     np.testing.assert_allclose(data["cameras"][0]["edges"][1], corners[1] * (1, -1, -1), atol=1e-4)
 
 
 def readings(shown=None, pixels=PIXELS) -> list[Reading]:
-    return [results.reading(shown or made_result(), pixel) for pixel in pixels]
+    shown = shown or made_result()
+    return [shown.reading(pixel) for pixel in pixels]
+
+
+def measured(shown, pixels) -> Measurement:
+    return Measurement.of(Result(shown, list(pixels)))
 
 
 def test_marks_are_the_points_and_every_two_are_a_segment():
     found = readings()
-    marks = json.loads(results.marks_data(found))
+    marks = json.loads(measured(made_result(), PIXELS).marks())
+    assert [tuple(point["px"]) for point in marks["points"]] == PIXELS
     assert [point["name"] for point in marks["points"]] == list("ABCDE")
     for point, each in zip(marks["points"], found, strict=True):
         np.testing.assert_allclose(point["at"], each.point_m, atol=5.1e-5)
@@ -145,7 +175,7 @@ def test_the_legend_of_depth_has_colours_and_ticks_at_the_same_places():
         [100 * np.log(z / near) / np.log(far / near) for z in values],
         atol=0.01,
     )
-    assert "linear-gradient(90deg" in html and "depth in metres" in html
+    assert "linear-gradient(90deg" in html and "Depth in metres" in html
 
 
 def test_the_legend_of_confidence_goes_from_0_to_100_per_cent():
@@ -157,62 +187,58 @@ def test_the_legend_of_confidence_goes_from_0_to_100_per_cent():
 
 
 @pytest.mark.parametrize("count", range(6))
-def test_a_measurement_says_every_point_and_every_segment(count):
+def test_a_measurement_lists_every_point_and_every_segment(count):
     shown = made_result()
-    found = results.measurement(shown, PIXELS[:count])
+    found = measured(shown, PIXELS[:count])
     assert [each.pixel for each in found.readings] == PIXELS[:count]
     each = readings(shown)[:count]
     segments = [(each[k], each[k + 1]) for k in range(0, count - 1, 2)]
     if count == 0:
-        assert found.words == look.HOW_TO_MEASURE and found.headline == look.headline("", look.CLICK_TWO)
-        np.testing.assert_array_equal(found.picture, shown.photograph)
+        assert found.html() == templates.HOW_TO_MEASURE
+        assert found.headline() == templates.headline("", templates.CLICK_TWO)
         return
-    rows = re.findall(r"<tr><td><b>(.)</b></td><td>(.*?)</td><td>(.*?)</td></tr>", found.words)
+    rows = re.findall(r"<tr><td><b>(.)</b></td><td>(.*?)</td><td>(.*?)</td></tr>", found.html())
     assert rows == [
         ("ABCDE"[k], metres(a.depth_m, a.spread_m), f"{100 * a.confidence:.0f} %") for k, a in enumerate(each)
     ]
-    told = re.findall(r'<div>Distance (.) to (.)</div><div class="distance">(.*?)</div>', found.words)
-    assert told == [
+    reported = re.findall(r'<div>Distance (.) to (.)</div><div class="distance">(.*?)</div>', found.html())
+    assert reported == [
         ("ABCDE"[2 * k], "ABCDE"[2 * k + 1], metres(*distance_m(a, b))) for k, (a, b) in enumerate(segments)
     ]
-    assert ("second point" in found.words) == (count % 2 == 1)
+    assert ("second point" in found.html()) == (count % 2 == 1)
     number = metres(each[-1].depth_m, each[-1].spread_m) if count % 2 else metres(*distance_m(*segments[-1]))
-    assert found.headline == look.headline(number, look.SECOND_POINT if count % 2 else look.CLICK_TWO)
-    of_example = results.measurement(replace(shown, title="x"), PIXELS[:count]).headline
-    assert of_example == look.headline(number, look.SECOND_POINT if count % 2 else look.CLICK_OR_BRING)
+    assert found.headline() == templates.headline(
+        number, templates.SECOND_POINT if count % 2 else templates.CLICK_TWO
+    )
+    of_example = measured(replace(shown, precomputed=True), PIXELS[:count]).headline()
+    assert of_example == templates.headline(
+        number, templates.SECOND_POINT if count % 2 else templates.CLICK_OR_BRING
+    )
 
 
 def test_a_confidence_that_is_not_there_is_unknown():
-    words = results.measurement(made_result(confidence=None), PIXELS[:1]).words
+    words = measured(made_result(confidence=None), PIXELS[:1]).html()
     assert "<td>unknown</td>" in words
 
 
-def test_points_are_marked_at_their_places_on_a_smaller_picture(monkeypatch):
-    """On a plain photograph: a dot at each point, a line between every two, and text above."""
-    shown = made_result(
-        photograph=np.full((H * 20, W * 20, 3), 90, np.uint8), confidence=None, uncertainty_m=None
-    )
-    shown = replace(shown, depth_m=np.full((H * 20, W * 20), 2.0, np.float32))
-    monkeypatch.setattr(results, "LARGEST_SIDE", 440)
-    pixels = [(100, 200), (500, 320), (700, 500)]
-    drawn = results.measurement(shown, pixels).picture
-    assert drawn.shape == (300, 440, 3)
-    for x, y in pixels:
-        assert drawn[y // 2, x // 2].tolist() == [0xC2, 0x41, 0x0C]
-    for share in (0.25, 0.35, 0.75):
-        at = np.rint([50 + 200 * share, 100 + 60 * share]).astype(int)
-        assert drawn[at[1], at[0]].tolist() == [255, 255, 255], "a white line between the first two"
-    for share in (0.2, 0.5, 0.8):
-        at = np.rint([250 + 100 * share, 160 + 90 * share]).astype(int)
-        assert drawn[at[1], at[0]].tolist() == [90, 90, 90], "and none to the third"
-    radius = max(3.0, 0.8 * 4.4)
-    dark = (drawn == 20).all(axis=-1)
-    for x, y in ((50, 100), (250, 160), (350, 250), (150, 130)):
-        up = 2.6 * radius if (x, y) != (150, 130) else 2.2 * radius
-        middle = round(y - up)
-        assert dark[middle - 8 : middle + 9, x - 12 : x + 13].any(), "a label"
-        assert not dark[middle + 25 : middle + 40, x - 12 : x + 13].any()
-    assert (drawn != 90).any(axis=-1).mean() < 0.1
+def test_an_uncertain_scale_widens_every_length_alike():
+    """Monte Carlo: one factor for both ends, and independent errors along their rays."""
+    shown = replace(made_result(), sigma_m=None, scale_rel_std=0.2)
+    a, b = (shown.reading(pixel) for pixel in PIXELS[:2])
+    length, spread = shown.distance(a, b)
+    alone = distance_m(a, b)
+    assert length == alone[0]
+    rng = np.random.default_rng(0)
+    factors = 1 + 0.2 * rng.normal(size=200_000)
+    drawn = factors * (length + alone[1] * rng.normal(size=200_000) / np.sqrt(1 + 0.2**2))
+    assert spread == pytest.approx(np.std(drawn), rel=0.02)
+    depth, of_depth = shown.depth_of(a)
+    assert of_depth == pytest.approx(np.hypot(a.spread_m, 0.2 * depth))
+    bare = replace(shown, confidence=None)
+    assert bare.distance(*(bare.reading(pixel) for pixel in PIXELS[:2]))[1] == pytest.approx(0.2 * length)
+    words = measured(shown, PIXELS[:2])
+    assert "± 20 % of the scale" in words.html() and metres(length, spread) in words.headline()
+    assert "of the scale" not in measured(made_result(), PIXELS[:2]).html()
 
 
 def rows_of(text: str) -> list[dict[str, str]]:
@@ -221,32 +247,27 @@ def rows_of(text: str) -> list[dict[str, str]]:
 
 def test_files_are_listed_in_order_and_measurements_are_numbers_of_the_readings(tmp_path):
     shown = made_result(folder=tmp_path)
-    assert results.files_of(made_result()) == []
+    assert results.files_of(Result(made_result())) == []
     wanted = (
         "depth_mm.png",
-        "depth.npy",
         "depth.png",
-        "confidence.npy",
-        "cloud.ply",
-        "cloud.glb",
         "mesh.glb",
+        "cloud.glb",
+        "cloud.ply",
         "report.json",
+        "depth.npy",
+        "confidence.npy",
     )
     for name in (*wanted[::-1], "zebra.txt", "a.txt"):
         (tmp_path / name).write_text(name)
     (tmp_path / "folder").mkdir()
-    names = [path.name for path in results.files_of(shown)]
-    assert names == ["everything.zip", *wanted, "a.txt", "zebra.txt"]
-    paths = results.files_of(shown, PIXELS)
-    assert [path.name for path in paths] == [
-        "everything.zip",
-        *wanted,
-        "a.txt",
-        "measurements.csv",
-        "zebra.txt",
-    ]
+    names = [path.name for path in results.files_of(Result(shown))]
+    assert names == ["result.zip", *wanted, "a.txt", "zebra.txt"]
+    paths = results.files_of(Result(shown, PIXELS))
+    table = ["result.zip", *wanted[:5], "measurements.csv", *wanted[5:], "a.txt", "zebra.txt"]
+    assert [path.name for path in paths] == table
     with ZipFile(paths[0]) as archive:
-        assert archive.namelist() == [path.name for path in paths[1:]]
+        assert archive.namelist() == [name for name in table[1:] if not name.endswith(".npy")]
         assert all(entry.compress_type == ZIP_STORED for entry in archive.infolist())
         assert archive.read("a.txt") == b"a.txt"
         rows = rows_of(archive.read("measurements.csv").decode())
@@ -266,8 +287,22 @@ def test_files_are_listed_in_order_and_measurements_are_numbers_of_the_readings(
         assert [row[name] for name in ("x_px", "y_px", "x_m", "y_m", "z_m", "confidence")] == [""] * 6
     stamp = paths[0].read_bytes()
     paths[0].write_bytes(b"kept")
-    assert results.files_of(shown, PIXELS)[0].read_bytes() == b"kept"
-    assert results.files_of(shown, PIXELS[:2])[0].read_bytes() not in (b"kept", stamp)
-    assert "measurements.csv" not in [path.name for path in results.files_of(shown)]
+    assert results.files_of(Result(shown, PIXELS))[0].read_bytes() == b"kept"
+    assert results.files_of(Result(shown, PIXELS[:2]))[0].read_bytes() not in (b"kept", stamp)
+    assert "measurements.csv" not in [path.name for path in results.files_of(Result(shown))]
     with ZipFile(paths[0]) as archive:
-        assert archive.namelist() == names[1:]
+        assert archive.namelist() == [name for name in names[1:] if not name.endswith(".npy")]
+
+
+def test_pixels_without_depth_are_hatched():
+    shown = made_result()
+    depth_m = shown.depth_m.copy()
+    depth_m[:, :12] = 0
+    image = results.map_image(replace(shown, depth_m=depth_m), "depth")
+    plain = colour_depth(depth_m)
+    np.testing.assert_array_equal(image[:, 12:], plain[:, 12:])
+    lines = (image != plain).any(-1)
+    assert (image[lines] == results.HATCH_LEVEL).all()
+    for row in range(len(image)):  # one stripe in every row, a pixel further left in the next
+        assert lines[row, :12].sum() == results.HATCH_PX // 4
+    np.testing.assert_array_equal(lines[1:, :11], lines[:-1, 1:12])

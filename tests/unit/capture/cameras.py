@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.types import DepthFrame
 from tests.unit.capture_room import FLIP, render
+from tests.views import posed_frame
 
 SIZES = [(48, 36), (40, 44), (66, 39), (44, 40)]
 FOCAL = [(41.0, 47.0), (38.0, 33.0), (52.0, 44.0), (36.0, 43.0)]
@@ -37,7 +38,7 @@ def depth_of(number: int) -> np.ndarray:
 
 def frame_of(number: int, factor: float | np.ndarray = 1.0, confidence: float = 0.6) -> DepthFrame:
     depth = (depth_of(number) * factor).astype(np.float32)
-    return DepthFrame(NAMES[number], depth, np.full_like(depth, confidence), KS[number], ES[number])
+    return posed_frame(NAMES[number], depth, np.full_like(depth, confidence), KS[number], ES[number])
 
 
 def write_capture(folder: Path, with_depth: bool = False) -> Path:

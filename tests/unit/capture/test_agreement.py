@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, median_filter
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.capture import agreement
-from geodiff_plugin.capture.agreement import agreed, rendered, scene_poses, seen_in, steadied
+from geodiff_plugin.capture.agreement import agreed, rendered, scene_poses, seen_in, temporally_smoothed
+from geodiff_plugin.pose import tracks
 from geodiff_plugin.types import DepthFrame
+from tests.lab.sequence import flicker, true_frames
+from tests.scenes import render_sequence
 from tests.unit.capture.cameras import ES, KS, SIZES, frame_of
 from tests.unit.capture_room import render
+from tests.views import posed_frame
+
+END_TO_END = pytest.mark.end_to_end
 
 #: A third of each side: pixels are compared in Python loops.
 SMALL = np.diag([1 / 3, 1 / 3, 1])
@@ -25,22 +33,22 @@ def small(number: int, seed: int = 0) -> DepthFrame:
     depth[3:8, 4:9] *= [0.72, 1.0, 1.35, 0.85][number]
     confidence = rng.uniform(0.0, 1.0, depth.shape)
     confidence[2:9, 3:10] *= [0.2, 1, 0.3, 0.9][number]
-    return DepthFrame("abcd"[number], depth.astype(np.float32), confidence.astype(np.float32), K, ES[number])
+    return posed_frame("abcd"[number], depth.astype(np.float32), confidence.astype(np.float32), K, ES[number])
 
 
 def pixels(frame: DepthFrame):
     """Row, column and world point of every pixel, by one 4x4 inverse of the projection."""
     P = np.eye(4)
-    P[:3] = frame.K @ np.linalg.inv(frame.E)[:3]
+    P[:3] = frame.camera.K @ np.linalg.inv(frame.camera.E)[:3]
     for row, column in np.ndindex(frame.depth.shape):
         z = float(frame.depth[row, column])
         yield row, column, np.linalg.solve(P, [column * z, row * z, z, 1])[:3]
 
 
-def seen_by(camera: DepthFrame, point: np.ndarray):
+def seen_by(frame: DepthFrame, point: np.ndarray):
     """Row, column and depth of a world point in a camera, ``None`` outside of its image."""
-    x, y, z = camera.K @ np.linalg.solve(camera.E, [*point, 1])[:3]
-    height, width = camera.depth.shape
+    x, y, z = frame.camera.K @ np.linalg.solve(frame.camera.E, [*point, 1])[:3]
+    height, width = frame.depth.shape
     if z <= 1e-6 or not (-0.5 < x / z < width - 0.5 and -0.5 < y / z < height - 0.5):
         return None
     return round(y / z), round(x / z), z
@@ -105,8 +113,8 @@ def expected_sums(frame: DepthFrame, others: list[DepthFrame]) -> dict[tuple[int
                 continue
             there, theirs = float(other.depth[at[:2]]), float(other.confidence[at[:2]])
             observers += there > 0.94 * at[2]
-            back = np.linalg.solve(other.K, [at[1], at[0], 1]) * there
-            d = np.linalg.solve(frame.E, other.E @ [*back, 1])[2]
+            back = np.linalg.solve(other.camera.K, [at[1], at[0], 1]) * there
+            d = np.linalg.solve(frame.camera.E, other.camera.E @ [*back, 1])[2]
             if abs(there / at[2] - 1) < 0.06 and abs(d / z - 1) < 0.06:
                 weights.append(0.05 + theirs)
                 inverses.append(1 / d)
@@ -155,7 +163,7 @@ def test_agreement_is_what_a_loop_over_pixels_finds(number, moving):
     np.testing.assert_allclose(found.depth, depth, rtol=1e-5)
     np.testing.assert_allclose(found.confidence, confidence, atol=1e-6)
     assert {values.dtype for values in (found.depth, found.confidence)} == {np.dtype(np.float32)}
-    assert found.name == frame.name and found.K is frame.K and found.E is frame.E
+    assert found.name == frame.name and found.camera is frame.camera
     if number == 3:  # what is sure keeps its depth if it may have moved
         sure = replaced & (frame.confidence >= 0.8)
         assert sure.any() != moving
@@ -168,7 +176,9 @@ def test_agreement_does_not_depend_on_the_unit_or_on_the_order_of_the_frames():
 
     def in_unit(factor: float) -> list[DepthFrame]:
         lengths = np.array([[1, 1, 1, factor]] * 3 + [[1] * 4])
-        return [replace(f, depth=f.depth * np.float32(factor), E=f.E * lengths) for f in frames]
+        cameras = [replace(f.camera, E=f.camera.E * lengths) for f in frames]
+        pairs = zip(frames, cameras, strict=True)
+        return [replace(f, depth=f.depth * np.float32(factor), camera=camera) for f, camera in pairs]
 
     found = agreed(frames[0], frames[1:])
     changed = [(agreed(frames[0], frames[:0:-1]), 1)]
@@ -209,8 +219,10 @@ def made_up_matches(count: int, seed: int = 0):
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     order = rng.permutation(count)
     more = np.zeros((count, 2))
-    before = agreement._Picture((np.c_[px, more], descriptors), K_before, depth)
-    after = agreement._Picture((np.c_[px_after[order], more], descriptors[order]), K_after, np.ones((20, 30)))
+    before = agreement._Image((np.c_[px, more], descriptors), Camera(K_before), depth)
+    after = agreement._Image(
+        (np.c_[px_after[order], more], descriptors[order]), Camera(K_after), np.ones((20, 30))
+    )
     return before, after, T
 
 
@@ -253,7 +265,7 @@ def video() -> tuple[np.ndarray, list[tuple[DepthFrame, np.ndarray]]]:
         image, depth = render(pose, size, K)
         depth = depth.astype(np.float32)
         frames.append(
-            (DepthFrame("", depth, np.ones_like(depth), K, np.eye(4)), image.astype(np.float32) / 255)
+            (posed_frame("", depth, np.ones_like(depth), K, np.eye(4)), image.astype(np.float32) / 255)
         )
     return E, frames
 
@@ -262,7 +274,7 @@ def video() -> tuple[np.ndarray, list[tuple[DepthFrame, np.ndarray]]]:
 def test_poses_of_a_video_are_metric_and_a_cut_begins_another_world(video, long_side, monkeypatch):
     """At their own size, and shrunk to a grid on which depth and K have to be shrunk as well."""
     sizes, find = [], agreement.sift_features
-    monkeypatch.setattr(agreement, "LONG_SIDE", long_side)
+    monkeypatch.setattr(tracks, "LONG_SIDE", long_side)
     monkeypatch.setattr(agreement, "sift_features", lambda grey: sizes.append(grey.shape) or find(grey))
     depths, motion = [], agreement._motion
     monkeypatch.setattr(agreement, "_motion", lambda *pair: depths.append(pair[1].depth) or motion(*pair))
@@ -287,13 +299,13 @@ def test_frames_of_a_video_agree_with_three_before_and_after_in_their_scene():
 
     def load(i: int) -> DepthFrame:
         depth = np.full((7, 9), 1 / inverse[i], np.float32)
-        return DepthFrame(f"f{i}", depth, np.full_like(depth, sure[i]), K, np.full((4, 4), np.nan))
+        return posed_frame(f"f{i}", depth, np.full_like(depth, sure[i]), K, np.full((4, 4), np.nan))
 
     inverse, sure = 1 / (2 + 0.01 * np.arange(11)), np.linspace(0.2, 0.7, 11)
     moved = np.eye(4)
     moved[2, 3] = 1e-3  # so that frames of both scenes would agree
     scenes = [[np.eye(4)] * 8, [moved] * 3]
-    found = list(steadied(scenes, load))
+    found = list(temporally_smoothed(scenes, load))
     assert [frame.name for frame in found] == [f"f{i}" for i in range(11)]
     for i, frame in enumerate(found):
         scene = range(8) if i < 8 else range(8, 11)
@@ -301,7 +313,7 @@ def test_frames_of_a_video_agree_with_three_before_and_after_in_their_scene():
         weights = [(1 + (j == i)) * (0.05 + sure[j]) for j in near]
         np.testing.assert_allclose(frame.depth, sum(weights) / np.dot(weights, inverse[near]), rtol=1e-5)
         assert (frame.confirmed == len(near) - 1).all()
-        np.testing.assert_array_equal(frame.E, np.eye(4) if i < 8 else moved)
+        np.testing.assert_array_equal(frame.camera.E, np.eye(4) if i < 8 else moved)
 
 
 @pytest.mark.parametrize("confidence", [0.79, 0.81])
@@ -311,10 +323,28 @@ def test_what_may_have_moved_in_a_video_is_not_outvoted_if_it_is_sure(confidence
 
     def load(i: int) -> DepthFrame:
         depth = np.full((7, 9), 1.0 if i == 2 else 2.0, np.float32)
-        return DepthFrame("", depth, np.full_like(depth, confidence if i == 2 else 1.0), K, np.eye(4))
+        return posed_frame("", depth, np.full_like(depth, confidence if i == 2 else 1.0), K, np.eye(4))
 
-    found = list(steadied([[np.eye(4)] * 5], load))
+    found = list(temporally_smoothed([[np.eye(4)] * 5], load))
     np.testing.assert_allclose(found[2].depth, 1.0 if confidence > 0.8 else 2.0, rtol=1e-6)
+
+
+def test_sigma_is_bounded_by_what_the_agreed_confidence_implies_and_that_of_other_frames_depth():
+    frames = [small(number) for number in range(4)]
+    sigma = 0.4 * frames[0].depth
+    sigma[:, ::2] = 0.001 * frames[0].depth[:, ::2]
+    sigma[1, 1] = np.nan  # unknown before other frames agreed
+    found = agreed(replace(frames[0], sigma=sigma.astype(np.float32)), frames[1:])
+    plain = agreed(frames[0], frames[1:])
+    np.testing.assert_array_equal(found.depth, plain.depth)
+    assert plain.sigma is None
+    bound = found.depth * 0.1 / norm.ppf((1 + np.clip(found.confidence.astype(float), 0.05, 0.999)) / 2)
+    own = np.isclose(found.sigma, sigma, rtol=1e-5)
+    bounded = np.isclose(found.sigma, bound, rtol=1e-4)
+    assert (own | bounded).all() and (found.sigma[:, ::2][own[:, ::2]] < 0.01).all()
+    outvoted = np.abs(found.depth / frames[0].depth - 1) > 0.06
+    assert outvoted.any() and bounded[outvoted].all(), "not the error of the depth that was replaced"
+    assert own.mean() > 0.3 and bounded[:, 1::2].mean() > 0.9
 
 
 def test_depth_of_a_frame_without_others_stays():
@@ -323,3 +353,75 @@ def test_depth_of_a_frame_without_others_stays():
     np.testing.assert_allclose(found.depth, frame.depth, rtol=1e-6)
     np.testing.assert_allclose(found.confidence, frame.confidence, rtol=1e-6)
     assert not found.confirmed.any() and not found.observers.any()
+
+
+def test_pixels_without_depth_stay_so_and_do_not_affect_other_frames():
+    frame, *others = (small(number) for number in range(4))
+    hole = np.zeros(frame.depth.shape, bool)
+    hole[:, : hole.shape[1] // 3] = True
+    masked = replace(
+        frame, depth=np.where(hole, 0, frame.depth), confidence=np.where(hole, 0, frame.confidence)
+    )
+    found = agreed(masked, others)
+    assert (
+        (found.depth[hole] == 0).all()
+        and (found.confidence[hole] == 0).all()
+        and (found.confirmed[hole] == 0).all()
+    )
+    assert (found.depth[~hole] > 0).all() and np.isfinite(found.depth).all()
+    assert not seen_in(masked, others[0]).inside[hole].any()
+    shown, _ = rendered(masked, others[0], masked.confidence)
+    whole, _ = rendered(frame, others[0], frame.confidence)
+    assert shown[shown > 0].min() >= whole[whole > 0].min()
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return render_sequence(1, 4, size=(144, 192))
+
+
+def of_depth(sequence, depths):
+    """The frames of a sequence with these depths, their pose not known, and their images."""
+    images = [view.image_01.permute(1, 2, 0).numpy() for view in sequence.lefts]
+    K, sure = sequence.K.numpy().astype(np.float64), np.full(depths[0].shape, 0.5)
+    return [posed_frame("", depth, sure, K, np.eye(4)) for depth in depths], images
+
+
+@END_TO_END
+def test_the_motion_of_the_camera_is_found_and_a_cut_begins_a_scene(sequence):
+    ground_truth = true_frames(sequence)
+    known, images = of_depth(sequence, [np.nan_to_num(frame.depth, nan=50.0) for frame in ground_truth])
+    (poses,) = scene_poses(zip(known, images, strict=True))
+    for frame, E in zip(ground_truth, poses, strict=True):
+        assert np.allclose(E, np.linalg.inv(ground_truth[0].camera.E) @ frame.camera.E, atol=0.01)
+    images[2:] = [image[:, ::-1].copy() for image in images[2:]]
+    assert [len(scene) for scene in scene_poses(zip(known, images, strict=True))] == [2, 2]
+    images[1] = np.zeros_like(images[1])  # nothing to be seen
+    assert [len(scene) for scene in scene_poses(zip(known, images, strict=True))] == [1, 1, 2]
+
+
+@END_TO_END
+def test_frames_that_agree_are_averaged_within_their_scene(sequence):
+    ground_truth = true_frames(sequence)
+    off = [0.02 * (-1) ** k for k in range(4)]
+    known, _ = of_depth(
+        sequence, [frame.depth * np.exp(o) for frame, o in zip(ground_truth, off, strict=True)]
+    )
+    of_camera = [np.linalg.inv(ground_truth[0].camera.E) @ frame.camera.E for frame in ground_truth]
+    temporal_smoothing = list(temporally_smoothed([of_camera], known.__getitem__))
+    errors = [
+        np.log(frame.depth / true.depth) for frame, true in zip(temporal_smoothing, ground_truth, strict=True)
+    ]
+    assert flicker(errors, ground_truth)[0] < 0.4 * 0.04
+    assert max(np.nanmean(np.abs(error)) for error in errors) < 0.7 * 0.02
+    known[1].depth[40:80, 60:100] *= 0.5  # something that moves: no other frame has it there
+    known[1].confidence[40:80, 60:100] = 0.9
+    there = list(temporally_smoothed([of_camera], known.__getitem__))[1]
+    np.testing.assert_allclose(
+        there.depth[45:75, 65:95], np.nan_to_num(known[1].depth[45:75, 65:95]), rtol=1e-6
+    )
+    assert not there.confirmed[45:75, 65:95].any()
+    apart = list(
+        temporally_smoothed([[E] for E in of_camera], known.__getitem__)
+    )  # every frame a scene of its own
+    assert all(np.allclose(a.depth, np.nan_to_num(k.depth)) for a, k in zip(apart, known, strict=True))

@@ -12,7 +12,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import Capture, plotting
-from geodiff_plugin._checks import InputFileError
+from geodiff_plugin._internal.checks import InputFileError
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.capture import results
 from geodiff_plugin.capture.agreement import agreed
 from geodiff_plugin.capture.frames import choose_neighbours
@@ -22,6 +23,7 @@ from geodiff_plugin.pose.multiview import SolvedCapture
 from geodiff_plugin.types import DepthFrame
 from tests.unit.capture.cameras import ES, KS, NAMES, SIZES, depth_of, frame_of, image_of, write_capture
 from tests.unit.capture_room import HALF, render
+from tests.views import posed_frame
 
 K = np.array([[31.0, 0.0, 9.3], [0.0, 26.0, 12.1], [0.0, 0.0, 1.0]])
 
@@ -31,7 +33,7 @@ def test_normals_of_a_plane_are_its_own_towards_the_camera():
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
     for normal in ([0.3, -0.2, -1.0], [-0.5, 0.4, -0.8], [0.1, 0.7, -0.6]):
         unit = np.array(normal) / np.linalg.norm(normal)
-        found = normals_of((-2.5 * np.linalg.norm(normal) / (rays @ normal)).astype(np.float64), K)
+        found = normals_of((-2.5 * np.linalg.norm(normal) / (rays @ normal)).astype(np.float64), Camera(K))
         assert found.dtype == np.float32 and found.shape == (22, 17, 3)
         np.testing.assert_allclose(found, np.broadcast_to(unit, found.shape), atol=1e-5)
 
@@ -39,7 +41,7 @@ def test_normals_of_a_plane_are_its_own_towards_the_camera():
 def test_kept_pixels_are_sure_or_confirmed_and_never_contradicted_nor_flying():
     confidence = np.repeat(np.float32([0.49, 0.5, 0.9]), 4).reshape(3, 4)
     confirmed, observers = np.uint8([[0, 0, 1, 3]] * 3), np.uint8([[0, 2, 1, 3]] * 3)
-    frame = DepthFrame("", np.ones((3, 4), np.float32), confidence, K, np.eye(4))
+    frame = posed_frame("", np.ones((3, 4), np.float32), confidence, K, np.eye(4))
     sure = confidence >= 0.5
     np.testing.assert_array_equal(kept(frame), sure)
     np.testing.assert_array_equal(kept(replace(frame, confirmed=confirmed)), sure)
@@ -49,7 +51,7 @@ def test_kept_pixels_are_sure_or_confirmed_and_never_contradicted_nor_flying():
     )
     spike = np.ones((7, 9), np.float32)
     spike[3, 4] = 0.5
-    found = kept(DepthFrame("", spike, np.ones_like(spike), K, np.eye(4)))
+    found = kept(posed_frame("", spike, np.ones_like(spike), K, np.eye(4)))
     np.testing.assert_array_equal(found, spike == 1)
 
 
@@ -78,12 +80,12 @@ def expected_cloud(frames: list[DepthFrame], every: list[int], factor: float) ->
     means = []
     for frame, step in zip(frames, every, strict=True):
         image, rows = image_of(NAMES.index(frame.name)), []
-        normals = normals_of(frame.depth, frame.K)
+        normals = normals_of(frame.depth, frame.camera)
         good = (frame.confidence >= 0.5) & ~flying_points(frame.depth)
         good &= (frame.confirmed > 0) | (frame.observers == 0)
         for v, u in np.argwhere(good)[::step]:
-            point = frame.E @ [*np.linalg.solve(frame.K, [u, v, 1]) * frame.depth[v, u], 1]
-            normal = np.linalg.solve(frame.E[:3, :3].T, normals[v, u])
+            point = frame.camera.E @ [*np.linalg.solve(frame.camera.K, [u, v, 1]) * frame.depth[v, u], 1]
+            normal = np.linalg.solve(frame.camera.E[:3, :3].T, normals[v, u])
             rows.append(np.r_[point[:3], normal, 255 * image[v, u]])
         means += mean_by_cell(rows, cell).values()
     return list(mean_by_cell(means, cell).values())
@@ -96,8 +98,8 @@ def in_order(rows: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("most", "names"), [(200_000, ["d", "a"]), (150, NAMES)])
 def test_a_fused_cloud_has_the_mean_of_every_cell(most, names, monkeypatch):
     """Also of every so many points of a frame, where it has more than a bound."""
-    monkeypatch.setattr(results, "CELL_SHARE", 0.03)
-    monkeypatch.setattr(results, "MOST_POINTS", most)
+    monkeypatch.setattr(results, "CELL_FRACTION", 0.03)
+    monkeypatch.setattr(results, "MAX_POINTS", most)
     frames = {name: doubted(NAMES.index(name)) for name in names}
     counts = [int(kept(frame).sum()) for frame in frames.values()]
     every = [max(1, count // most) for count in counts]
@@ -120,7 +122,8 @@ def test_a_cloud_of_the_room_lies_on_its_walls_with_their_normals_and_paint(monk
         monkeypatch.setattr(results, "MERGED_AFTER", merged_after)
         longer = np.array([[1, 1, 1, factor]] * 3 + [[1] * 4])
         scaled = {
-            n: replace(f, depth=f.depth * np.float32(factor), E=f.E * longer) for n, f in frames.items()
+            n: replace(f, depth=f.depth * np.float32(factor), camera=replace(f.camera, E=f.camera.E * longer))
+            for n, f in frames.items()
         }
         cloud, normals = fuse(NAMES, scaled.__getitem__, lambda name: image_of(NAMES.index(name)))
         points = cloud.points_m / factor
@@ -150,7 +153,7 @@ def test_points_closer_than_a_cell_are_one_in_every_direction_and_on_either_side
         camera = np.diag(
             [260 * nearness, 260 * nearness, 1.0]
         )  # neighbouring pixels are 3.8 or 0.96 mm apart
-        frame = DepthFrame("a", depth, np.ones_like(depth), camera, np.eye(4))
+        frame = posed_frame("a", depth, np.ones_like(depth), camera, np.eye(4))
         cloud, _ = fuse(["a"], lambda name, frame=frame: frame, lambda name: np.ones((9, 11, 3)))
         sizes.append(cloud.points_m[:, :2].max(0) // 0.004 + 1)
         assert len(cloud.points_m) == len(np.unique(np.floor(cloud.points_m[:, :2] / 0.004), axis=0))
@@ -224,16 +227,37 @@ def test_points_that_two_frames_of_a_workspace_see_have_their_tracks_and_colours
         assert len(set(images)) == len(images) == sum(row in rows for _, rows in seen)
 
 
+def test_gsplat_finds_the_depth_of_points_in_every_image(workspace):
+    """As ``examples/datasets/colmap.py`` of gsplat reads a folder: sparse model, images by name, tracks."""
+    frames, _, _, folder = workspace
+    model = pytest.importorskip("pycolmap").Reconstruction(str(folder / "sparse"))
+    images = {number: model.images[number] for number in model.reg_image_ids()}
+    assert sorted(image.name for image in images.values()) == sorted(
+        p.name for p in (folder / "images").iterdir()
+    )
+    seen = {number: [] for number in images}
+    for point in model.points3D.values():
+        for element in point.track.elements:
+            seen[element.image_id].append(point.xyz)
+    for number, points in seen.items():
+        image, frame = images[number], next(f for f in frames if images[number].name == f"{f.name}.png")
+        T = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        np.testing.assert_allclose(T, np.linalg.inv(frame.camera.E), atol=1e-6)
+        inside = T[:3, :3] @ np.reshape(points, (-1, 3)).T + T[:3, 3:]
+        assert (inside[2] > 0).all()
+        assert len(points) > 0
+
+
 def test_maps_and_lists_of_a_workspace_are_those_of_its_frames(workspace):
     frames, _, _, folder = workspace
     for number, (name, frame) in enumerate(zip(NAMES, frames, strict=True)):
-        with Image.open(folder / "images" / f"{name}.png") as picture:
-            np.testing.assert_array_equal(picture, np.rint(255 * image_of(number)))
+        with Image.open(folder / "images" / f"{name}.png") as rgb:
+            np.testing.assert_array_equal(rgb, np.rint(255 * image_of(number)))
         depth, normals = (
             folder / f"stereo/{kind}_maps/{name}.png.geometric.bin" for kind in ("depth", "normal")
         )
         np.testing.assert_array_equal(read_colmap_map(depth), np.where(kept(frame), frame.depth, 0))
-        np.testing.assert_array_equal(read_colmap_map(normals), normals_of(frame.depth, frame.K))
+        np.testing.assert_array_equal(read_colmap_map(normals), normals_of(frame.depth, frame.camera))
     assert (folder / "stereo/fusion.cfg").read_text().split() == [f"{name}.png" for name in NAMES]
     lines = (folder / "stereo/patch-match.cfg").read_text().splitlines()
     assert lines == [line for name in NAMES for line in (f"{name}.png", "__auto__, 20")]
@@ -260,7 +284,10 @@ def finished(tmp_path) -> Capture:
     """A capture whose frames have depth by their own runs in ``out``, each with errors of its own."""
     capture = Capture.open(write_capture(tmp_path / "scan"))
     off = np.diag([1.02, 0.97, 1.0]), np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * 0.1
-    capture.frames = [replace(f, K=off[0] @ f.K, E=off[1] @ f.E) for f in capture.frames]  # before the solve
+    capture.frames = [
+        replace(f, camera=replace(f.camera, K=off[0] @ f.camera.K), E=off[1] @ f.E)  # before the solve
+        for f in capture.frames
+    ]
     points = np.random.default_rng(3).uniform((-1, -1, 1.5), (1.5, 1, 2.6), (60, 3))
     rows = [np.arange(0, 45), np.arange(10, 60), np.arange(20, 60), np.arange(5, 40)]
     seen = tuple((np.full((len(each), 2), 7.0), each) for each in rows)
@@ -272,7 +299,8 @@ def finished(tmp_path) -> Capture:
         confidence = rng.uniform(0, 1, depth.shape)
         confidence[:3] = 0
         (tmp_path / "out" / name).mkdir(parents=True)
-        results.save_alone(tmp_path / "out" / name, depth, confidence)
+        sigma = np.where(confidence > 0, depth * rng.uniform(0.01, 0.4, depth.shape), np.nan)
+        results.save_alone(tmp_path / "out" / name, depth, confidence, sigma)
     return capture
 
 
@@ -283,17 +311,17 @@ def plain_figures(monkeypatch):
 
 
 def alone(out, number: int) -> DepthFrame:
-    depth, confidence = (
-        np.load(out / NAMES[number] / f"{kind}_alone.npy") for kind in ("depth", "confidence")
+    depth, confidence, sigma = (
+        np.load(out / NAMES[number] / f"{kind}_alone.npy") for kind in ("depth", "confidence", "sigma")
     )
-    return DepthFrame(NAMES[number], depth, confidence, KS[number], ES[number])
+    return replace(posed_frame(NAMES[number], depth, confidence, KS[number], ES[number]), sigma=sigma)
 
 
-def test_agreement_of_finished_frames_is_written_and_its_shares_are_of_what_was_written(finished, tmp_path):
+def test_agreement_of_finished_frames_is_written_and_its_fractions_match_the_files(finished, tmp_path):
     """Only frames of the run take part."""
     out, run = tmp_path / "out", ["d", "a", "c"]
-    shares = results.write_agreement(finished, out, run)
-    assert list(shares) == run
+    fractions = results.write_agreement(finished, out, run)
+    assert list(fractions) == run
     for name in run:
         number = NAMES.index(name)
         near = choose_neighbours(finished.solved, number, 9, [NAMES.index(other) for other in run])
@@ -304,11 +332,16 @@ def test_agreement_of_finished_frames_is_written_and_its_shares_are_of_what_was_
         ):
             np.testing.assert_array_equal(found, values)
         _, _, confirmed, asked = maps
-        assert shares[name]["checked_against"] == len(near) == 2
-        assert shares[name]["confirmed"] == pytest.approx(np.mean(confirmed > 0), abs=6e-5)
-        assert shares[name]["unconfirmed"] == pytest.approx(np.mean((asked > 0) & (confirmed == 0)), abs=6e-5)
-        assert all(round(share, 4) == share for share in shares[name].values())
-        assert 0.001 < shares[name]["unconfirmed"] < shares[name]["confirmed"] < 0.95
+        np.testing.assert_array_equal(np.load(out / name / "sigma.npy"), expected.sigma)
+        sigma_mm = np.asarray(Image.open(out / name / "sigma_mm.png"))
+        np.testing.assert_array_equal(sigma_mm == 0, np.isnan(expected.sigma))
+        assert fractions[name]["checked_against"] == len(near) == 2
+        assert fractions[name]["confirmed"] == pytest.approx(np.mean(confirmed > 0), abs=6e-5)
+        assert fractions[name]["unconfirmed"] == pytest.approx(
+            np.mean((asked > 0) & (confirmed == 0)), abs=6e-5
+        )
+        assert all(round(fraction, 4) == fraction for fraction in fractions[name].values())
+        assert 0.001 < fractions[name]["unconfirmed"] < fractions[name]["confirmed"] < 0.95
         whole = np.asarray(Image.open(out / name / "depth_mm.png"))
         np.testing.assert_array_equal(whole == 0, maps[1] == 0)
         assert np.abs(whole - 1000.0 * maps[0])[whole > 0].max() < 0.51 and (whole == 0).any()
@@ -330,19 +363,21 @@ def test_a_frame_is_checked_against_six_others_at_most(finished, tmp_path, monke
 
 def test_depth_without_a_confidence_is_half_sure(tmp_path):
     depth = np.random.default_rng(0).uniform(1, 2, (4, 6))
-    results.save_alone(tmp_path, depth, None)
+    results.save_alone(tmp_path, depth, None, None)
+    assert np.isnan(np.load(tmp_path / "sigma_alone.npy")).all()
     np.testing.assert_array_equal(np.load(tmp_path / "depth_alone.npy"), depth.astype(np.float32))
     assert (np.load(tmp_path / "confidence_alone.npy") == 0.5).all()
     assert np.load(tmp_path / "confidence_alone.npy").dtype == np.float32
 
 
 def test_a_cleared_frame_keeps_the_files_of_others(tmp_path):
-    ours = "depth_alone.npy confidence_alone.npy depth.npy confidence.npy confirmed.npy asked.npy"
+    ours = "depth_alone confidence_alone sigma_alone depth confidence sigma confirmed asked"
     for extra, left in (("notes.txt", True), (None, False)):
         folder = tmp_path / "a"
         folder.mkdir(exist_ok=True)
         for name in [
-            *ours.split()[: 6 if left else 5],
+            *(f"{file}.npy" for file in ours.split()[: 8 if left else 7]),
+            "sigma_mm.png",
             "depth_mm.png",
             "depth.png",
             "cloud.ply",
@@ -357,19 +392,19 @@ def test_a_cleared_frame_keeps_the_files_of_others(tmp_path):
             (folder / extra).unlink()
 
 
-def test_finished_frames_of_a_video_become_steady_and_the_same_call_again_changes_nothing(
+def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes_nothing(
     plain_figures, tmp_path
 ):
     """Depth by a run is kept on first use. The second scene has a frame more than the first."""
     camera, size = np.array([[150.0, 0, 84.0], [0, 132.0, 68.0], [0, 0, 1]]), (170, 128)
-    images, frames, truths = [], [], []
+    images, frames, ground_truths = [], [], []
     for i in range(5):
         turn, E = [10 + i, 15 - 2 * i + 180 * (i > 1), 20 + 3 * i], np.eye(4)
         E[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
         E[:3, 3] = 0.07 * i - 0.1, 0.04 * (i % 2), -0.3
         image, depth = render(E, size, camera)
         images.append(image.astype(np.float32) / 255)
-        truths.append(depth)
+        ground_truths.append(depth)
         folder = tmp_path / f"f{i}"
         folder.mkdir()
         np.save(folder / "depth.npy", (depth * (1 + 0.01 * (-1) ** i)).astype(np.float32))
@@ -377,18 +412,21 @@ def test_finished_frames_of_a_video_become_steady_and_the_same_call_again_change
             np.save(folder / "confidence.npy", np.full(depth.shape, 0.1 + 0.2 * i, np.float32))
         frames.append(FinishedFrame(folder, camera, "m"))
     before = [np.load(frame.folder / "depth.npy") for frame in frames]
-    assert results.write_steady(frames, images.__getitem__) == [0, 0, 1, 1, 1]
-    steady = [np.load(frame.folder / "depth.npy") for frame in frames]
+    assert results.write_smoothed(frames, images.__getitem__) == [0, 0, 1, 1, 1]
+    temporal_smoothing = [np.load(frame.folder / "depth.npy") for frame in frames]
     for i, frame in enumerate(frames):
         np.testing.assert_array_equal(np.load(frame.folder / "depth_alone.npy"), before[i])
         sure = np.load(frame.folder / "confidence_alone.npy")
         np.testing.assert_array_equal(sure, np.full(sure.shape, 0.1 + 0.2 * i if i else 0.5, np.float32))
         middle = slice(40, 90), slice(50, 120)
-        off = [np.abs(depth / truths[i] - 1)[middle].mean() for depth in (steady[i], before[i])]
+        off = [
+            np.abs(depth / ground_truths[i] - 1)[middle].mean()
+            for depth in (temporal_smoothing[i], before[i])
+        ]
         assert off[0] < 0.8 * off[1]
         assert np.median(np.load(frame.folder / "asked.npy")[middle]) == (1 if i < 2 else 2)
-    results.write_steady(frames, images.__getitem__)
-    for frame, depth in zip(frames, steady, strict=True):
+    results.write_smoothed(frames, images.__getitem__)
+    for frame, depth in zip(frames, temporal_smoothing, strict=True):
         np.testing.assert_array_equal(np.load(frame.folder / "depth.npy"), depth)
 
 
@@ -410,7 +448,7 @@ def test_the_cloud_of_a_capture_is_read_by_trimesh_with_its_cameras(
             np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "asked")
         )
         asked = np.ones_like(asked) if not_trusted == [name] else asked
-        frames[name] = DepthFrame(name, depth, confidence, KS[number], ES[number], confirmed, asked)
+        frames[name] = posed_frame(name, depth, confidence, KS[number], ES[number], confirmed, asked)
     cloud, normals = fuse(NAMES, frames.__getitem__, finished.image)
     read = trimesh.load(out / "cloud.ply", process=False)
     assert counts == {"cloud_points": len(cloud.points_m)}
@@ -444,7 +482,7 @@ def test_exports_are_written_on_demand_from_the_agreed_frames(finished, plain_fi
     data = json.loads((out / "nerfstudio/transforms.json").read_text())
     for number, (name, entry) in enumerate(zip(NAMES, data["frames"], strict=True)):
         maps = [np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "asked")]
-        use = kept(DepthFrame(name, *maps[:2], KS[number], ES[number], *maps[2:]))
+        use = kept(posed_frame(name, *maps[:2], KS[number], ES[number], *maps[2:]))
         units = np.asarray(Image.open(out / "nerfstudio" / entry["depth_file_path"]))
         np.testing.assert_array_equal(units > 0, use)
         np.testing.assert_allclose(units[use], 1000 * maps[0][use], atol=0.51)
@@ -491,7 +529,7 @@ def test_the_sheet_has_every_frame_and_its_depth_and_marks_those_that_are_not_tr
     np.testing.assert_array_equal(together, [np.load(tmp_path / name / "depth.npy") for name in shown])
 
 
-def test_the_video_shows_images_beside_depth_in_the_colours_of_one_range(
+def test_the_video_shows_images_next_to_depth_in_the_colours_of_one_range(
     finished, plain_figures, tmp_path, monkeypatch
 ):
     """All frames have one size, whatever the size of their images."""
@@ -575,7 +613,7 @@ def test_a_mesh_is_made_of_the_kept_pixels_of_all_frames_by_their_own_cameras(tm
     write_mesh(tmp_path / "mesh.ply", NAMES, frames.__getitem__, lambda name: image_of(NAMES.index(name)))
     points, colours = [], []
     for number, frame in enumerate(frames.values()):
-        points.append(frame.world(kept(frame)))
+        points.append(frame.world()[kept(frame)])
         colours.append(255 * image_of(number)[kept(frame)])
     found = trimesh.load(tmp_path / "mesh.ply", process=False)
     np.testing.assert_allclose(found.vertices, np.concatenate(points), atol=1e-5)
@@ -587,10 +625,10 @@ def test_a_mesh_is_made_of_the_kept_pixels_of_all_frames_by_their_own_cameras(tm
 def test_a_video_that_cannot_be_written_is_warned_of(finished, plain_figures, tmp_path, monkeypatch):
     """Everything else is there."""
 
-    def refuse(*_: object) -> None:
+    def raise_input_error(*_: object) -> None:
         raise InputFileError("No codec.")
 
-    monkeypatch.setattr(plotting, "write_depth_video", refuse)
+    monkeypatch.setattr(plotting, "write_depth_video", raise_input_error)
     with pytest.warns(UserWarning, match="No codec") as caught:
         out, counts = written(finished, tmp_path)
     assert [warning.message.args[0].code for warning in caught] == ["capture.no-video"]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.cli import app as module
 from geodiff_plugin.cli.app import COMMANDS, main
 from geodiff_plugin.evaluation.options import COMMANDS as EVALUATIONS
@@ -69,8 +69,8 @@ def test_depth_of_one_pair_holds_its_folder_while_it_runs(pair, called):
     [
         ([], "cli.run.run_many"),
         (["--engine", "ray"], "cli.run.run_parquet"),
-        (["--engine", "ray", "--as", "parquet"], "cli.run.run_parquet"),
-        (["--engine", "ray", "--as", "folders"], "cli.run.run_many"),
+        (["--engine", "ray", "--format", "parquet"], "cli.run.run_parquet"),
+        (["--engine", "ray", "--format", "folders"], "cli.run.run_many"),
     ],
 )
 def test_depth_of_folders_is_that_of_many_pairs(pair, called, words, where, capsys):
@@ -82,7 +82,7 @@ def test_depth_of_folders_is_that_of_many_pairs(pair, called, words, where, caps
     assert called[-1][1][0].out == Path("mine")
 
 
-def test_how_pairs_were_assumed_to_belong_is_said_unless_it_is_to_be_quiet(pair, called, capsys):
+def test_assumed_pairing_is_reported_unless_quiet(pair, called, capsys):
     for path in Path("right").iterdir():
         path.rename(path.with_name(f"r{path.name}"))
     assert run("depth", "left", "right", *CAMERA) == 0
@@ -94,23 +94,26 @@ def test_how_pairs_were_assumed_to_belong_is_said_unless_it_is_to_be_quiet(pair,
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["left.png", "right.png", "--tolerance", "0.1"], "--tolerance is for bags"),
-        (["left.png", "right.png", "--left", "/a"], "--left is for bags"),
-        (["left.png", "right.png", "--encoding", "32FC1"], "--encoding is for bags"),
-        (["left", "right", "--right", "/a"], "--right is for bags"),
-        (["left.png", "right.png", "--steady"], "--steady needs frames in order"),
-        (["left.png", "right.png", "--shard", "0/2"], "--shard is for many pairs"),
-        (["left.png", "right.png", "--engine", "ray"], "--engine is for many pairs"),
+        (["left.png", "right.png", "--tolerance", "0.1"], "--tolerance needs a bag as LEFT"),
+        (["left.png", "right.png", "--left-topic", "/a"], "--left-topic needs a bag as LEFT"),
+        (["left.png", "right.png", "--encoding", "32FC1"], "--encoding needs a bag as LEFT"),
+        (["left", "right", "--right-topic", "/a"], "--right-topic needs a bag as LEFT"),
+        (
+            ["left.png", "right.png", "--temporal-smoothing"],
+            "--temporal-smoothing needs a sequence of frames",
+        ),
+        (["left.png", "right.png", "--shard", "0/2"], "--shard needs many pairs"),
+        (["left.png", "right.png", "--engine", "ray"], "--engine needs many pairs"),
     ],
 )
-def test_options_of_other_inputs_are_refused(pair, called, words, said, capsys):
+def test_options_of_other_inputs_are_rejected(pair, called, words, said, capsys):
     assert run("depth", *words, *CAMERA) == 2
     assert said in capsys.readouterr().err and called == []
 
 
 def test_a_bag_is_recognised_by_its_name(pair, called):
     Path("run.mcap").write_bytes(b"bag")
-    assert run("depth", "run.mcap", "--left", "/a", "--right", "/b", "--tolerance", "0.1") == 0
+    assert run("depth", "run.mcap", "--left-topic", "/a", "--right-topic", "/b", "--tolerance", "0.1") == 0
     ((where, (options,), _),) = called
     assert where == "cli.run.run_bag" and (options.topic_left, options.tolerance) == ("/a", 0.1)
 
@@ -137,7 +140,7 @@ def test_the_demo_runs_on_the_bundled_pairs(tmp_path, monkeypatch, called):
 
 #: Commands: what is typed, the function that runs, and the values that it gets.
 TYPED = {
-    "info": ([], "cli.info.run_info", {"prior": None, "space": None, "knobs": False}),
+    "info": ([], "cli.info.run_info", {"prior": None, "space": None, "parameters": False}),
     "video": (
         ["a", "b.npy"],
         "cli.results.run_video",
@@ -159,7 +162,14 @@ TYPED = {
     "app": (
         [],
         "app.launch.run_app",
-        {"prior": ("bundled",), "device": "auto", "host": "127.0.0.1", "port": None, "browser": False},
+        {
+            "prior": ("bundled",),
+            "device": "auto",
+            "dtype": "float32",
+            "host": "127.0.0.1",
+            "port": None,
+            "browser": False,
+        },
     ),
     "convert": (
         ["a", "b"],
@@ -181,7 +191,7 @@ def test_a_command_passes_its_options_by_name_with_their_defaults(called, name):
     [
         (["info", "--prior", "a/b"], "prior", "a/b"),
         (["info", "--space", "log"], "space", "log"),
-        (["info", "--knobs"], "knobs", True),
+        (["info", "--parameters"], "parameters", True),
         (["video", "a", "--near", "1.5"], "near", 1.5),
         (["video", "a", "--far", "9"], "far", 9.0),
         (["video", "a", "--fps", "25", "--overwrite"], "overwrite", True),
@@ -216,10 +226,10 @@ def test_what_an_option_cannot_be_ends_with_code_2_before_the_work(called, words
 
 
 def test_bench_and_capture_get_their_options_as_one(called):
-    assert run("bench", "--prior", "a/b", "--steps", 3, "--graphs") == 0
+    assert run("bench", "--prior", "a/b", "--steps", 3, "--cuda-graphs") == 0
     where, (options,), _ = called[-1]
     assert where == "cli.demo.run_bench"
-    assert (options.prior, options.steps, options.graphs, options.no_kernels) == ("a/b", 3, True, False)
+    assert (options.prior, options.steps, options.cuda_graphs, options.no_triton) == ("a/b", 3, True, False)
     assert run("capture", "scan", "--neighbours", 3) == 0
     where, (options,), _ = called[-1]
     assert where == "cli.run.run_capture" and (options.path, options.neighbours) == (Path("scan"), 3)

@@ -1,31 +1,31 @@
-"""Options of dataclasses as typer has them: what can be typed, what help shows, and what a command gets."""
+"""Options of dataclasses on a command line: what can be typed, what help shows, and what a command gets."""
 
 import errno
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 
 import pytest
-import typer.main
 from click.testing import CliRunner
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.jobs.stopping import Terminated
-from geodiff_plugin.options import OUTPUT, SPEED, Command, declare
+from geodiff_plugin.options import OUTPUT, SPEED, Command
+from geodiff_plugin.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """One option of every kind."""
 
-    source: Path = declare(MISSING, "The source.", "", metavar="SRC")
-    count: int = declare(3, "A count.", low=1, high=9)
-    share: float | None = declare(None, "A share.", "--part", "-p")
-    names: tuple[str, ...] = declare(("a", "b"), "Names.", split=True, choices=("a", "b", "c"))
-    numbers: tuple[int, ...] = declare((), "Numbers.", split=True)
-    files: tuple[Path, ...] = declare((), "Files; repeat it.")
-    loud: bool = declare(False, "Be loud.", panel=SPEED)
-    out: str | None = declare(None, "Where to.", panel=OUTPUT)
+    source: Path = setting(MISSING, "The source.", "", metavar="SRC")
+    count: int = setting(3, "A count.", low=1, high=9)
+    fraction: float | None = setting(None, "A share.", "--part", "-p")
+    names: tuple[str, ...] = setting(("a", "b"), "Names.", comma_separated=True, choices=("a", "b", "c"))
+    numbers: tuple[int, ...] = setting((), "Numbers.", comma_separated=True)
+    files: tuple[Path, ...] = setting((), "Files; repeat it.")
+    loud: bool = setting(False, "Be loud.", section=SPEED)
+    out: str | None = setting(None, "Where to.", section=OUTPUT)
     hidden: int = 7
 
 
@@ -40,7 +40,7 @@ def typed():
 
 
 def call(group, *words) -> tuple[int, str]:
-    ran = CliRunner().invoke(typer.main.get_command(group), [str(word) for word in words])
+    ran = CliRunner().invoke(group, [str(word) for word in words], prog_name="outer")
     if ran.exception and not isinstance(ran.exception, SystemExit):
         raise ran.exception
     return ran.exit_code, ran.output
@@ -55,14 +55,14 @@ def test_what_is_typed_is_given_in_the_types_of_the_fields(typed):
     assert made == Options(
         source=Path("src"),
         count=5,
-        share=0.25,
+        fraction=0.25,
         names=("b", "c"),
         numbers=(3, 1),
         files=(Path("x"), Path("y")),
         loud=True,
         out="o",
     )
-    assert isinstance(made.count, int) and isinstance(made.share, float)
+    assert isinstance(made.count, int) and isinstance(made.fraction, float)
 
 
 def test_what_is_not_typed_is_the_default_of_its_field(typed):
@@ -76,20 +76,20 @@ def test_what_is_not_typed_is_the_default_of_its_field(typed):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--count", "2.5"], "--count must be a whole number; got '2.5'. Give the number alone"),
-        (["--count", "x"], "--count must be a whole number; got 'x'."),
-        (["-p", "0,12"], "--part must be a number; got '0,12'. Decimals follow a point: 0.12."),
-        (["-p", "3m"], "--part must be a number; got '3m'. Give the number alone; --help names its unit."),
+        (["--count", "2.5"], "--count must be an integer; got '2.5'. Give only the number"),
+        (["--count", "x"], "--count must be an integer; got 'x'."),
+        (["-p", "0,12"], "--part must be a number; got '0,12'. Use a decimal point: 0.12."),
+        (["-p", "3m"], "--part must be a number; got '3m'. Give only the number; --help states its unit."),
         (["--count", "10"], "--count must be between 1 and 9; got 10"),
         (["--names", "a,d"], "--names must be one of a, b, c; got 'd'"),
-        (["--numbers", "1,x"], "--numbers must be whole numbers, comma-separated; got '1,x'"),
-        (["--numbers", "1,-2"], "--numbers must be whole numbers, comma-separated"),
+        (["--numbers", "1,x"], "--numbers must be comma-separated integers; got '1,x'."),
+        (["--numbers", "1,2.5"], "--numbers must be comma-separated integers"),
     ],
 )
 def test_what_an_option_cannot_be_is_one_line_and_code_2(typed, words, said, capsys):
     got, group = typed
     with pytest.raises(SystemExit) as leaving:
-        group(["run", "src", *words], standalone_mode=False)
+        group.main(["run", "src", *words])
     assert leaving.value.code == 2 and got == []
     err = capsys.readouterr().err
     assert err.startswith(f"geodiff: {said}") and err.count("\n") == 1
@@ -98,23 +98,24 @@ def test_what_an_option_cannot_be_is_one_line_and_code_2(typed, words, said, cap
 def test_help_shows_every_declared_option_in_its_group_with_its_default(typed):
     _, group = typed
     code, text = call(group, "run", "--help")
-    lines = [" ".join(line.strip("│ ").split()) for line in text.splitlines()]
+    lines = [" ".join(line.split()) for line in text.splitlines()]
     assert code == 0 and "hidden" not in text
     for part in (
-        "* SRC <path> The source. [required]",
+        "Usage: outer run [OPTIONS] SRC",
+        "SRC The source.",
         "--count NUMBER A count. [default: 3]",
-        "--part -p NUMBER A share.",
-        "--names TEXT Names (default: a, b).",
+        "-p, --part NUMBER A share.",
+        "--names TEXT Names. [default: a, b]",
         "--numbers NUMBER Numbers.",
         "--files PATH Files; repeat it.",
         "--loud Be loud.",
         "--out TEXT Where to.",
-        "--help -h Show this message and exit.",
+        "-h, --help Show this message and exit.",
     ):
         assert part in lines, (part, text)
-    places = [text.index(title) for title in ("SRC", "─ Options", f"─ {OUTPUT}", f"─ {SPEED}")]
+    places = [text.index(f"\n{title}:") for title in ("Positional arguments", "Options", OUTPUT, SPEED)]
     assert places == sorted(places)
-    between = text[text.index(f"─ {OUTPUT}") : text.index(f"─ {SPEED}")]
+    between = text[text.index(f"\n{OUTPUT}") : text.index(f"\n{SPEED}")]
     assert "--out" in between and "--help" in between and "--loud" not in between
     code, text = call(group, "--help")
     assert "Outer." in text and "Does something." in text and "More." in text
@@ -124,22 +125,22 @@ def test_help_shows_every_declared_option_in_its_group_with_its_default(typed):
 def test_all_choices_together_are_called_all():
     @dataclass(frozen=True, kw_only=True)
     class All:
-        names: tuple[str, ...] = declare(("a", "b"), "Names.", split=True, choices=("b", "a"))
+        names: tuple[str, ...] = setting(("a", "b"), "Names.", comma_separated=True, choices=("b", "a"))
 
     group = new_group(
         "G.", {"x": Command(All, lambda made: None, "X."), "y": Command(All, print, "Y.")}, True
     )
-    assert "Names (default: all)." in call(group, "x", "--help")[1]
+    assert "Names. [default: all]" in call(group, "x", "--help")[1]
 
 
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
         (InputError("it is torn"), 2, "geodiff: it is torn\n"),
-        (KeyboardInterrupt(), 130, "geodiff: interrupted; the same command resumes\n"),
-        (Terminated(), 143, "geodiff: terminated; the same command resumes\n"),
-        (MemoryError(), 2, "geodiff: the memory is not enough. Make the pictures smaller"),
-        (RuntimeError("CUDA out of memory"), 2, "geodiff: the memory is not enough."),
+        (KeyboardInterrupt(), 130, "geodiff: interrupted. Run the same command again to resume.\n"),
+        (Terminated(), 143, "geodiff: terminated. Run the same command again to resume.\n"),
+        (MemoryError(), 2, "geodiff: out of memory. Downscale the images"),
+        (RuntimeError("CUDA out of memory"), 2, "geodiff: out of memory."),
     ],
 )
 def test_what_ends_a_command_is_a_line_and_an_exit_code(error, code, said, capsys):
@@ -148,7 +149,7 @@ def test_what_ends_a_command_is_a_line_and_an_exit_code(error, code, said, capsy
 
     group = new_group("G.", {"x": Command(Options, fails, "X."), "y": Command(Options, fails, "Y.")}, True)
     with pytest.raises(SystemExit) as leaving:
-        group(["x", "src"], standalone_mode=False)
+        group.main(["x", "src"])
     assert leaving.value.code == code and capsys.readouterr().err.startswith(said)
 
 
@@ -158,4 +159,4 @@ def test_a_defect_keeps_its_traceback():
 
     group = new_group("G.", {"x": Command(Options, fails, "X."), "y": Command(Options, fails, "Y.")}, True)
     with pytest.raises(OSError, match="a defect"):
-        group(["x", "src"], standalone_mode=False)
+        group.main(["x", "src"])

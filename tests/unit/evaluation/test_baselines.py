@@ -1,13 +1,16 @@
 """What methods hand to pipelines, guidance, sweeps and matchers, and how they read back what these answer."""
 
+import json
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from geodiff_plugin.config import DEFAULT, FAST, PAPER, PRIOR_FIT
 from geodiff_plugin.evaluation import baselines
@@ -22,10 +25,19 @@ from geodiff_plugin.evaluation.baselines import (
     method,
     unguided,
 )
-from geodiff_plugin.evaluation.datasets import SampleRef
-from geodiff_plugin.evaluation.datasets.sample import ExtraView, make_sample
+from geodiff_plugin.evaluation.baselines.unguided import sgbm_shift
+from geodiff_plugin.evaluation.datasets import find_pairs, load
+from geodiff_plugin.evaluation.datasets.sample import ExtraView, SampleRef, StereoSample, make_sample
+from geodiff_plugin.evaluation.experiment import score
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.types import Rig
+from geodiff_plugin.findings import Finding
+from geodiff_plugin.formats import write_depth_mm, write_pfm
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
+from tests.contracts.tiny_transformers import MODELS, make_transformers
+from tests.evaluating import write_scenes
+from tests.views import made_rig
+
+END_TO_END = pytest.mark.end_to_end
 
 SIZE = (40, 56)
 
@@ -48,7 +60,7 @@ def make(further=2, **changes):
     views = tuple(
         ExtraView(image(36 + i, 50), camera(42 + i, 24), pose(0.3, 0.1 * (i + 1))) for i in range(further)
     )
-    rig = Rig(camera(50, 27), camera(50, 29.5), pose(0.2))
+    rig = made_rig(camera(50, 27), camera(50, 29.5), pose(0.2))
     depth = rng.uniform(1, 4, SIZE)
     sample = make_sample(
         SampleRef("d", "s", {}), (image(*SIZE), image(*SIZE)), rig, depth, {}, extra_views=views
@@ -89,7 +101,7 @@ class Spy:
     def __call__(self, image, **call):
         self.calls.append((image, call))
         maps = np.arange(1, 1 + np.prod(SIZE), dtype=float).reshape(1, *SIZE, 1)
-        given = {"prediction": maps, "uncertainty": None, "confidence": None, "warnings": (), "poses": ()}
+        given = {"prediction": maps, "uncertainty": None, "confidence": None, "findings": (), "poses": ()}
         given |= {"scale": None, "shift": None, "global_scale": None, "visible": None}
         return SimpleNamespace(**given | self.answer)
 
@@ -110,7 +122,8 @@ def test_a_guided_answer_is_the_first_maps_with_notes_of_every_number(spied):
     pose = SimpleNamespace(status="refined", residual_px_given=(1.23456, 2.0), residual_px=(0.5, 0.25))
     numbers = {"scale": torch.tensor([[1.23456789]]), "shift": torch.tensor([[-0.5, 0.5]])}
     visible = np.array([True, True, False])
-    spied.spy.answer = maps | numbers | {"poses": (pose, None), "visible": visible, "warnings": ("said",)}
+    findings = (Finding("scale.none", "No unit."), Finding("camera.from-exif", "Of EXIF."))
+    spied.spy.answer = maps | numbers | {"poses": (pose, None), "visible": visible, "findings": findings}
     call = {"ensemble_size": 2, "processing_resolution": 32}
     found = guided.guided_prediction(spied.spy, make(), "guidance", call)
     ((image, given),) = spied.spy.calls
@@ -122,24 +135,28 @@ def test_a_guided_answer_is_the_first_maps_with_notes_of_every_number(spied):
         0.7,
     )
     assert found.notes == {
-        **{"warnings": ["said"], "scale": [1.234568], "shift": [-0.5, 0.5], "pose": "refined"},
+        "findings": [
+            {"code": "scale.none", "severity": "warning", "text": "No unit."},
+            {"code": "camera.from-exif", "severity": "assumption", "text": "Of EXIF."},
+        ],
+        **{"scale": [1.234568], "shift": [-0.5, 0.5], "pose": "refined"},
         **{"residual_px_given": [1.235, 2.0], "residual_px": [0.5, 0.25], "visible": 0.6667},
     }
     spied.spy.answer = {"global_scale": torch.tensor([2.5])}
     plain = guided.guided_prediction(spied.spy, make(), "guidance", {"ensemble_size": 1})
     assert plain.uncertainty is plain.confidence is None
-    assert plain.notes == {"warnings": [], "global_scale": [2.5]}
+    assert plain.notes == {"findings": [], "global_scale": [2.5]}
     assert spied.spy.calls[1][1]["output_uncertainty"] is False
 
 
 def test_guidance_has_the_views_the_shared_evidence_and_what_is_known_of_the_baseline(spied):
     sample = make()
-    made = guided._guidance(sample, Settings(views=3), spied.priors, GeometryGuidance, crisp=False)
+    made = guided.guidance_of(sample, Settings(views=3), spied.priors, GeometryGuidance, refine_edges=False)
     assert made.evidence_store is spied.priors.evidence and made.measured_baseline is False
-    assert made.config == DEFAULT.changed(crisp=False) and len(made.inputs[0].views) == 2
+    assert made.config == DEFAULT.changed(refine_edges=False) and len(made.inputs[0].views) == 2
     perturbed = replace(sample, E_true=sample.E)
-    assert guided._guidance(perturbed, Settings(), spied.priors, GeometryGuidance).measured_baseline is True
-    two = guided._guidance(sample, Settings(views=2), spied.priors, GeometryGuidance)
+    assert guided.guidance_of(perturbed, Settings(), spied.priors, GeometryGuidance).measured_baseline is True
+    two = guided.guidance_of(sample, Settings(views=2), spied.priors, GeometryGuidance)
     assert len(two.inputs[0].views) == 1
 
 
@@ -153,9 +170,9 @@ def test_presets_are_those_of_their_names(spied):
         assert call["generator"].initial_seed() == 4
     METHODS["scale-shift-only"].run(sample, Settings(), spied.priors)
     config = spied.spy.calls[-1][1]["guidance"].config
-    assert config == DEFAULT.changed(optimize_latents=False, crisp=False)
-    find_method("paper:inner_steps=3+g_s_range=[2,5]").run(sample, Settings(), spied.priors)
-    assert spied.spy.calls[-1][1]["guidance"].config == PAPER.changed(inner_steps=3, g_s_range=(2.0, 5.0))
+    assert config == DEFAULT.changed(optimize_latents=False, refine_edges=False)
+    find_method("paper:guidance_steps=3+g_s_range=[2,5]").run(sample, Settings(), spied.priors)
+    assert spied.spy.calls[-1][1]["guidance"].config == PAPER.changed(guidance_steps=3, g_s_range=(2.0, 5.0))
     assert spied.asked[-1] == Settings()
     spied.adapter.network_input = None
     with pytest.raises(NotApplicable):
@@ -178,8 +195,10 @@ def test_reprojection_guides_the_plain_map_at_the_priors_resolution(spied, monke
         assert values[0, 1] == 2 and values.shape == SIZE and space == "log"
         assert settings == Settings(resolution=resolution)
         config = preset(*guided.posed_views(make(), 2)).config
-        assert (config.inner_steps, config.step_latents, config.min_steps) == (50, 0.01, 1)
-        assert dict(config.weights) == dict(PAPER.weights) and not config.correct and not config.crisp
+        assert (config.guidance_steps, config.lr_latents, config.min_steps) == (50, 0.01, 1)
+        assert (
+            dict(config.weights) == dict(PAPER.weights) and not config.fit_matches and not config.refine_edges
+        )
     assert all(call["match_input_resolution"] is False for _, call in spied.spy.calls)
 
 
@@ -230,13 +249,13 @@ def test_a_ramp_is_guided_in_as_many_rounds_as_the_preset_makes_with_the_prior(s
 def test_withheld_poses_keep_images_cameras_and_the_length_of_the_baseline(spied, monkeypatch):
     sample, asked = make(), []
 
-    def from_photographs(images, **given):
+    def from_unposed_images(images, **given):
         asked.append((images, given))
         if given["K"][0][0, 0] == 99:
             raise ValueError("too few matches")
         return "guidance"
 
-    monkeypatch.setattr(guided.GeometryGuidance, "from_photographs", from_photographs)
+    monkeypatch.setattr(guided.GeometryGuidance, "from_unposed_images", from_unposed_images)
     run = find_method("guided:pose=estimated").run
     run(sample, Settings(views=3), spied.priors)
     images, given = asked[0]
@@ -255,9 +274,9 @@ def test_withheld_poses_keep_images_cameras_and_the_length_of_the_baseline(spied
 
 
 def test_configurations_hold_every_setting_that_changes_a_result():
-    settings = Settings(prior="x", graphs=True, no_kernels=True, seed=3)
+    settings = Settings(prior="x", cuda_graphs=True, no_triton=True, seed=3)
     plain = METHODS["prior-aligned"].configuration(settings)
-    free = {"prior", "graphs", "no_kernels"}
+    free = {"prior", "cuda_graphs", "no_triton"}
     assert set(plain) == {f.name for f in fields(Settings)} - free and plain["seed"] == 3
     default = METHODS["guided"].configuration(settings)
     assert set(default) == set(plain) | {"guidance"}
@@ -277,8 +296,11 @@ def test_names_bind_priors_and_seeds():
     assert find_method("guided").adapted(Settings(prior="y", seed=1)) == Settings(prior="y", seed=1)
     zero = find_method("paper#0")
     assert (zero.seed, zero.base_name, zero.adapted(Settings(seed=4)).seed) == (0, "paper", 0)
-    assert find_method("guided:rule=sgd+inner_steps=2").title == "guided, rule=sgd, inner_steps=2"
-    assert list(FAMILIES) == ["guided", "paper", "hf", "files", "prior-map"]
+    assert (
+        find_method("guided:optimizer=sgd+guidance_steps=2").title
+        == "guided, optimizer=sgd, guidance_steps=2"
+    )
+    assert list(FAMILIES) == ["guided", "paper", "hf", "files", "prior-map", "points-map"]
     assert [m for m in METHODS if METHODS[m].uses_prior] == list(METHODS)[: len(guided.GUIDED_METHODS)]
     for name in ("guided@", "sgbm#1", "sgbm@x", "nothing", "guided#x"):
         with pytest.raises(ValueError, match="methods must be"):
@@ -288,8 +310,8 @@ def test_names_bind_priors_and_seeds():
 def test_a_cache_loads_a_prior_once_for_each_choice(monkeypatch):
     loaded, enabled = [], []
 
-    def load_prior(name, **told):
-        loaded.append((name, told))
+    def load_prior(name, **reported):
+        loaded.append((name, reported))
         return SimpleNamespace(set_progress_bar_config=lambda disable: enabled.append(disable))
 
     monkeypatch.setattr(method, "load_prior", load_prior)
@@ -300,14 +322,14 @@ def test_a_cache_loads_a_prior_once_for_each_choice(monkeypatch):
     pipe = cache.get(first)
     assert cache.get(replace(first, seed=3, steps=2, ensemble=5, views=4, resolution=9)) is pipe
     assert loaded == [("bundled", {"device": "cpu", "dtype": torch.float32})]
-    assert enabled == [True, {"graphs": False, "kernels": True}]
+    assert enabled == [True, {"cuda_graphs": False, "kernels": True}]
     changes = ({"prior": "x"}, {"device": "cuda"}, {"dtype": "bfloat16"}, {"space": "log"})
-    changes = (*changes, {"graphs": True}, {"no_kernels": True})
+    changes = (*changes, {"cuda_graphs": True}, {"no_triton": True})
     pipes = {id(cache.get(replace(first, **change))) for change in changes}
     assert len(pipes | {id(pipe)}) == 7 == len(loaded)
     assert loaded[3][1] == {"device": "cpu", "dtype": torch.bfloat16} and loaded[4][1]["space"] == "log"
-    assert enabled[-3] == {"graphs": True, "kernels": True} and enabled[-1] == {
-        "graphs": False,
+    assert enabled[-3] == {"cuda_graphs": True, "kernels": True} and enabled[-1] == {
+        "cuda_graphs": False,
         "kernels": False,
     }
 
@@ -333,7 +355,9 @@ def test_a_sweep_has_as_many_right_views_as_asked_and_finds_a_wall():
     K, E = np.array([[40.0, 0, 31.5], [0, 40.0, 23.5], [0, 0, 1]]), np.eye(4)
     E[0, 3] = 0.2  # the wall is 2 m away
     images = wide[:, :width], wide[:, shift:]
-    sample = make_sample(SampleRef("d", "s", {}), images, Rig(K, K, E), np.full((height, width), 2.0), {})
+    sample = make_sample(
+        SampleRef("d", "s", {}), images, made_rig(K, K, E), np.full((height, width), 2.0), {}
+    )
     found = METHODS["sweep-sgm"].run(sample, Settings(), PriorCache())
     assert found.space == "disparity" and found.depth_m.shape == (height, width)
     np.testing.assert_allclose(found.depth_m[8:-8, 12:-8], 2.0, rtol=0.05)
@@ -389,6 +413,57 @@ def test_maps_of_a_folder_become_a_prior(tmp_path, monkeypatch, kind, space):
         own.run(make(), Settings(), "priors")
 
 
+@pytest.mark.parametrize("with_confidence", [True, False])
+def test_maps_of_a_folder_become_known_depths_with_their_confidence(tmp_path, monkeypatch, with_confidence):
+    sample, handed = slope(), []
+    monkeypatch.setattr(
+        unguided, "guidance_of", lambda *given, **changes: handed.append((given, changes)) or "g"
+    )
+    monkeypatch.setattr(unguided, "guided_prediction", lambda *given: given)
+    disparity = 30 * 0.2 / sample.depth_m - 2.0  # less doffs
+    disparity[3, 4:7] = np.nan, 0, -1
+    np.save(tmp_path / "folder_mine.npy", disparity)
+    confidence = np.random.default_rng(3).random(SHAPE).astype(np.float32)
+    if with_confidence:
+        (tmp_path / "confidence").mkdir()
+        np.save(tmp_path / "confidence" / "folder_mine.npy", confidence)
+    own = find_method(f"points-map:disparity:{tmp_path}")
+    priors = SimpleNamespace(get=lambda settings: f"pipe {settings.prior}")
+    pipe, used, guidance, call = own.run(sample, Settings(prior="x", steps=3), priors)
+    assert (pipe, guidance, call["num_inference_steps"]) == ("pipe x", "g", 3) and used is sample
+    ((given, changes),) = handed
+    assert given == (sample, Settings(prior="x", steps=3), priors, GeometryGuidance)
+    known = np.ones(SHAPE, bool)
+    known[3, 4:7] = False
+    np.testing.assert_allclose(changes["points"], np.where(known, sample.depth_m, 0), rtol=1e-5)
+    if with_confidence:
+        np.testing.assert_array_equal(changes["points_confidence"], np.where(known, confidence, 0))
+    else:
+        assert changes["points_confidence"] is None
+    assert own.uses_prior and own.title == f"guided, points of {tmp_path.name}"
+    assert "guidance" in own.configuration(Settings())
+
+
+def test_known_depths_are_metric_and_confidence_has_the_size_of_the_image(tmp_path):
+    with pytest.raises(ValueError, match="points-map with maps of kind depth or disparity"):
+        find_method(f"points-map:relative-depth:{tmp_path}")
+    with pytest.raises(ValueError, match="points-map:DIR or points-map:KIND:DIR with an existing folder"):
+        find_method("points-map:nowhere")
+    (tmp_path / "confidence").mkdir()
+    np.save(tmp_path / "folder_mine.npy", slope().depth_m)
+    np.save(tmp_path / "confidence" / "folder_mine.npy", np.ones((3, 4), np.float32))
+    with pytest.raises(ValueError, match=r"confidence/folder_mine\.npy must be for 48 x 32 pixels"):
+        run(f"points-map:{tmp_path}", slope())
+
+
+@pytest.mark.end_to_end
+def test_known_depths_of_a_folder_pull_the_result_to_themselves(tmp_path, priors, textured_plane):
+    sample = plane_sample(textured_plane)
+    np.save(tmp_path / "folder_plane.npy", sample.depth_m)
+    prediction = find_method(f"points-map:{tmp_path}").run(sample, Settings(steps=1), priors)
+    assert np.median(np.abs(prediction.depth_m / sample.depth_m - 1)) < 0.02
+
+
 def test_relative_maps_may_be_negative_and_png_has_holes_of_0(tmp_path):
     values = np.array([[-1.0, 0.0, 2.0], [np.inf, np.nan, 3.0]])
     np.save(tmp_path / "m.npy", values)
@@ -396,3 +471,193 @@ def test_relative_maps_may_be_negative_and_png_has_holes_of_0(tmp_path):
     np.testing.assert_array_equal(read("relative-depth"), [[-1, 0, 2], [np.nan, np.nan, 3]])
     np.testing.assert_array_equal(read("disparity"), [[np.nan, np.nan, 2], [np.nan, np.nan, 3]])
     assert Path(tmp_path / "m.npy").is_file() and baselines.FAMILIES["files"] is unguided.files_method
+
+
+SHAPE = (32, 48)
+
+
+def plane_sample(pair, E=None) -> StereoSample:
+    rig = made_rig(pair.K, pair.K, pair.E if E is None else E)
+    return make_sample(SampleRef("folder", "plane", {}), (pair.left, pair.right), rig, pair.depth_m, {})
+
+
+class OnePipe(PriorCache):
+    """A cache that holds one pipeline, whatever prior but a map it is asked for."""
+
+    def __init__(self, pipe):
+        super().__init__()
+        self._pipe = enable_geometry_guidance(pipe)
+
+    def get(self, settings):
+        return super().get(settings) if settings.prior == "map" else self._pipe
+
+
+@pytest.fixture
+def priors(make_pipeline):
+    return OnePipe(make_pipeline())
+
+
+@END_TO_END
+@pytest.mark.parametrize("name", METHODS)
+def test_method_handles_a_rectified_pair_and_a_posed_one_or_states_why_not(name, priors, textured_plane):
+    E = textured_plane.E.copy()
+    E[1, 3] = 0.05
+    for sample in (plane_sample(textured_plane), plane_sample(textured_plane, E)):
+        if name == "sgbm-wls" and sample.rectified and not hasattr(cv2, "ximgproc"):
+            with pytest.raises(NotApplicable, match="opencv-contrib-python"):
+                METHODS[name].run(sample, Settings(), priors)
+        elif name in ("sgbm", "sgbm-wls") and not sample.rectified:
+            with pytest.raises(NotApplicable, match="not rectified"):
+                METHODS[name].run(sample, Settings(), priors)
+        else:
+            prediction = METHODS[name].run(sample, Settings(steps=1), priors)
+            assert (prediction.depth_m is None) != (prediction.relative is None)
+            assert score(sample, prediction, cap_m=None)["all_pixels"]["aligned"]["coverage"] > 0.5
+            json.dumps(dict(prediction.notes))
+
+
+@END_TO_END
+@pytest.mark.parametrize("name", [*METHODS, "hf:somewhere/model"])
+def test_configuration_is_json_and_names_what_matters(name):
+    """Seconds of another device are another result, but of SGBM, which OpenCV runs on the CPU."""
+    method = find_method(name)
+    assert method.name == name and method.summary
+    settings = Settings(), Settings(seed=1), Settings(device="cuda")
+    plain, other, on_cuda = (json.dumps(method.configuration(s), sort_keys=True) for s in settings)
+    assert (plain != other) == method.uses_prior and (on_cuda == plain) == (name in ("sgbm", "sgbm-wls"))
+    assert "bundled" not in plain  # the prior has its own place in the key
+
+
+@END_TO_END
+def test_an_ensemble_brings_uncertainty_and_metres_are_aligned_in_the_priors_space(
+    make_pipeline, textured_plane
+):
+    sample, priors = plane_sample(textured_plane), OnePipe(make_pipeline(prediction_type="log"))
+    spread = METHODS["search-only"].run(sample, Settings(steps=1, ensemble=3), priors)
+    assert spread.uncertainty.shape == sample.depth_m.shape and spread.space == "log"
+
+
+@END_TO_END
+def test_fingerprint_distinguishes_priors_and_decoders(make_pipeline, tmp_path):
+    pipes = [make_pipeline() for _ in range(4)]
+    next(pipes[2].unet.parameters()).data += 1
+    pipes[3].register_to_config(prediction_type="disparity")
+    same, again, trained, other_space = (OnePipe(pipe).fingerprint(Settings()) for pipe in pipes)
+    assert same == again and len({same, trained, other_space}) == 3
+    for name in (f"guided:decoder={tmp_path}", f"hf:{tmp_path}", f"files:{tmp_path}"):
+        before = find_method(name).configuration(Settings())
+        (tmp_path / f"{len(name)}.safetensors").write_bytes(b"trained further")
+        assert find_method(name).configuration(Settings()) != before
+
+
+@END_TO_END
+@pytest.mark.parametrize("name", ["paper", "guided:gradient=full"])
+def test_no_gradient_goes_through_a_network_that_does_not_see_z_t(name, textured_plane):
+    with pytest.raises(NotApplicable, match="not an input of this prior's network"):
+        find_method(name).run(plane_sample(textured_plane), Settings(), OnePipe(make_transformers("glpn")))
+
+
+def slope() -> StereoSample:
+    """A slope from 1 to 2.5 m; the right camera's principal point lies 2 px further (doffs)."""
+    image, E = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8), np.eye(4)
+    K, K_right = (np.array([[30.0, 0, cx], [0, 30.0, 15.5], [0, 0, 1]]) for cx in (23.5, 25.5))
+    E[0, 3], depth_m = 0.2, np.linspace(1.0, 2.5, SHAPE[1], dtype=np.float32)[None].repeat(SHAPE[0], 0)
+    return make_sample(SampleRef("folder", "mine", {}), (image, image), made_rig(K, K_right, E), depth_m, {})
+
+
+def run(name, sample):
+    return find_method(name).run(sample, Settings(), PriorCache())
+
+
+def write_disparity_png(path, values):
+    Image.fromarray(np.rint(256 * values).astype(np.uint16)).save(path)
+
+
+@END_TO_END
+@pytest.mark.parametrize(
+    ("kind", "suffix", "save", "hole", "tolerance"),
+    [
+        ("depth", ".pfm", write_pfm, 0, 1e-6),
+        ("depth", ".png", write_depth_mm, 0, 1e-3),
+        ("disparity", ".npy", np.save, np.inf, 1e-5),
+        ("disparity", ".png", write_disparity_png, 0, 2e-3),
+    ],
+)
+def test_metric_maps_are_read_and_holes_stay(tmp_path, kind, suffix, save, hole, tolerance):
+    sample = slope()
+    values = sample.depth_m.copy() if kind == "depth" else 30.0 * 0.2 / sample.depth_m - 2
+    values[:3, :3] = hole
+    save(tmp_path / f"folder_mine{suffix}", values)
+    prediction = run(f"files:{kind}:{tmp_path}", sample)
+    assert np.isnan(prediction.depth_m[:3, :3]).all()
+    np.testing.assert_allclose(prediction.depth_m[3:], sample.depth_m[3:], rtol=tolerance)
+
+
+@END_TO_END
+def test_the_confidence_next_to_a_map_is_scored_with_it(tmp_path):
+    sample = slope()
+    np.save(tmp_path / "folder_mine.npy", 30.0 * 0.2 / sample.depth_m - 2)
+    given = np.random.default_rng(3).random(SHAPE).astype(np.float32)
+    assert run(f"files:disparity:{tmp_path}", sample).confidence is None
+    (tmp_path / "confidence").mkdir()
+    np.save(tmp_path / "confidence/folder_mine.npy", given)
+    prediction = run(f"files:disparity:{tmp_path}", sample)
+    np.testing.assert_array_equal(prediction.confidence, given)
+    record = score(sample, prediction, None)
+    assert len(record["risk_coverage"]["risk"]) == 20 and record["ause_confidence"]["ause"] is not None
+
+
+@END_TO_END
+def test_relative_maps_are_aligned_only_and_another_size_is_resized_in_value_too(tmp_path):
+    sample, path = slope(), tmp_path / "folder_mine.npy"
+    np.save(path, 7 - 3 / sample.depth_m)  # no map of inverse depth falls with it
+    record = score(sample, run(f"files:relative-disparity:{tmp_path}", sample), None)["all_pixels"]
+    assert record["raw"] is None and record["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)
+    np.save(path, np.full((2 * SHAPE[0], 2 * SHAPE[1]), 2 * 3.0))
+    np.testing.assert_allclose(run(f"files:disparity:{tmp_path}", sample).depth_m, 6.0 / (3 + 2), rtol=1e-6)
+
+
+@END_TO_END
+@pytest.mark.parametrize(
+    ("name", "content", "changes", "error", "said"),
+    [
+        ("files:{}", None, {}, NotApplicable, "no map"),
+        ("files:disparity:{}", np.ones(SHAPE), {"rectified": False}, NotApplicable, "not rectified"),
+        ("files:{}", np.full(SHAPE, 2000), {}, ValueError, r"metres as floats.*int64.*1000 for millimetres"),
+        ("files:{}/nowhere", None, {}, ValueError, "files:KIND:DIR with an existing folder"),
+        ("hf:", None, {}, ValueError, "hf:MODEL"),
+        ("sgbm", None, {"right": np.zeros((16, 48, 3), np.uint8)}, NotApplicable, "different sizes"),
+    ],
+)
+def test_what_does_not_apply_is_a_reason_and_what_is_wrong_is_named(
+    tmp_path, name, content, changes, error, said
+):
+    if content is not None:
+        np.save(tmp_path / "folder_mine.npy", content)
+    with pytest.raises(error, match=said):
+        run(name.format(tmp_path), replace(slope(), **changes))
+
+
+@END_TO_END
+@pytest.mark.parametrize(("kind", "metric"), [("dpt", False), ("glpn", True)])
+def test_depth_models_of_transformers_answer(tmp_path, kind, metric):
+    torch.manual_seed(0)
+    model, preparation = MODELS[kind]()
+    model.save_pretrained(tmp_path / "tiny-model")
+    (tmp_path / "tiny-model" / "preprocessor_config.json").write_text(json.dumps(preparation))
+    name = f"hf:{tmp_path / 'tiny-model'}"
+    method, prediction = find_method(name), run(name, slope())
+    assert method.title == "tiny-model" and not method.uses_prior
+    assert prediction.space == ("depth" if metric else "disparity")
+    assert prediction.relative.shape == SHAPE and np.isfinite(prediction.relative).all()
+    assert (prediction.depth_m is not None) == metric
+
+
+@END_TO_END
+@pytest.mark.parametrize("doffs", [0.0, 3.5])
+def test_sgbm_recovers_a_known_shift(tmp_path, doffs):
+    wall = load(find_pairs(write_scenes(tmp_path, "wall"))[0])
+    sample = replace(wall, K_right=wall.K_right + np.array([[0, 0, doffs], [0, 0, 0], [0, 0, 0]]))
+    shift = sgbm_shift(sample)
+    assert np.isfinite(shift).mean() > 0.8 and np.nanmedian(shift) == pytest.approx(8 + doffs, abs=1 / 16)
+    assert np.median(run("sgbm", sample).depth_m) == pytest.approx(10 / (8 + doffs), rel=0.02)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.evaluation import captures
 from geodiff_plugin.evaluation.options import CAPTURE_ROWS, CaptureEvalOptions
-from geodiff_plugin.types import DepthFrame
+from tests.views import posed_frame
 
 SIZE = (24, 32)
 NORMAL = np.array([0.2, -0.3, 1.0])
@@ -17,16 +17,22 @@ NORMAL = np.array([0.2, -0.3, 1.0])
 
 def test_the_f_score_counts_what_is_near_both_ways():
     rng = np.random.default_rng(0)
-    truth = rng.uniform(0, 1, (60, 3)) * [1, 1, 0.1]
-    points = np.concatenate([truth[:25] + 0.04 / np.sqrt(3), truth[25:30] + 0.2, rng.uniform(5, 6, (40, 3))])
-    gaps = np.linalg.norm(points[:, None] - truth[None], axis=-1)
+    ground_truth = rng.uniform(0, 1, (60, 3)) * [1, 1, 0.1]
+    points = np.concatenate(
+        [ground_truth[:25] + 0.04 / np.sqrt(3), ground_truth[25:30] + 0.2, rng.uniform(5, 6, (40, 3))]
+    )
+    gaps = np.linalg.norm(points[:, None] - ground_truth[None], axis=-1)
     accuracy, complete = (gaps.min(1) < 0.05).mean(), (gaps.min(0) < 0.05).mean()
     assert 0.2 < accuracy < complete < 1
     expected = 2 * accuracy * complete / (accuracy + complete)
-    assert captures.f_score(points, truth) == pytest.approx(expected)
-    assert captures.f_score(truth, points) == pytest.approx(expected)
-    assert captures.f_score(truth, truth) == pytest.approx(1)
-    for first, second in ((points[:0], truth), (truth, points[:0]), (truth, truth + 9.0)):
+    assert captures.f_score(points, ground_truth) == pytest.approx(expected)
+    assert captures.f_score(ground_truth, points) == pytest.approx(expected)
+    assert captures.f_score(ground_truth, ground_truth) == pytest.approx(1)
+    for first, second in (
+        (points[:0], ground_truth),
+        (ground_truth, points[:0]),
+        (ground_truth, ground_truth + 9.0),
+    ):
         assert captures.f_score(first, second) == 0.0
 
 
@@ -39,7 +45,7 @@ def plane_frame(name, angles, place, focal, factor=1.0, size=SIZE):
     v, u = np.mgrid[: size[0], : size[1]]
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
     depth = (2.0 - NORMAL @ E[:3, 3]) / (rays @ E[:3, :3].T @ NORMAL)
-    return DepthFrame(name, factor * depth, np.ones(size), K, E)
+    return posed_frame(name, factor * depth, np.ones(size), K, E)
 
 
 def make_frames(factors=(1.0, 1.0, 1.0)):
@@ -57,8 +63,10 @@ def temporal_reference(frames):
         for a, b in ((first, second), (second, first)):
             off = []
             for (v, u), depth in np.ndenumerate(a.depth):
-                world = a.E[:3, :3] @ (np.linalg.inv(a.K) @ [u, v, 1.0] * depth) + a.E[:3, 3]
-                x, y, z = b.K @ (b.E[:3, :3].T @ (world - b.E[:3, 3]))
+                world = (
+                    a.camera.E[:3, :3] @ (np.linalg.inv(a.camera.K) @ [u, v, 1.0] * depth) + a.camera.E[:3, 3]
+                )
+                x, y, z = b.camera.K @ (b.camera.E[:3, :3].T @ (world - b.camera.E[:3, 3]))
                 column, row = round(x / z), round(y / z)
                 if 0 <= column < b.depth.shape[1] and 0 <= row < b.depth.shape[0]:
                     off.append(abs(z / b.depth[row, column] - 1))
@@ -81,12 +89,12 @@ def test_the_temporal_error_is_that_of_a_loop_over_pixels_in_per_cent():
 
 def test_scores_of_a_frame_are_raw_scaled_and_within_ratios():
     rng = np.random.default_rng(1)
-    truth, known = rng.uniform(1, 5, SIZE), rng.random(SIZE) > 0.3
-    depth = truth * 1.2 * np.exp(rng.normal(0, 0.1, SIZE))
+    ground_truth, known = rng.uniform(1, 5, SIZE), rng.random(SIZE) > 0.3
+    depth = ground_truth * 1.2 * np.exp(rng.normal(0, 0.1, SIZE))
     depth[~known] = 77.0
-    ratios = [d / t for d, t, k in zip(depth.flat, truth.flat, known.flat, strict=True) if k]
+    ratios = [d / t for d, t, k in zip(depth.flat, ground_truth.flat, known.flat, strict=True) if k]
     scale = sorted(ratios)[len(ratios) // 2] if len(ratios) % 2 else np.median(ratios)
-    assert captures._scores(depth, truth, known) == pytest.approx(
+    assert captures._scores(depth, ground_truth, known) == pytest.approx(
         {
             "abs_rel": np.mean([abs(r - 1) for r in ratios]),
             "scaled": np.mean([abs(r / scale - 1) for r in ratios]),
@@ -105,7 +113,7 @@ def test_a_cloud_keeps_one_known_point_of_a_cell():
     frames = [make_frames()[i] for i in (0, 1, 1)]
     known = [np.zeros(SIZE, bool) for _ in frames]
     known[0][3:20, 5:9], known[1][4:9, 20:30], known[2][2:7, 25:31] = True, True, True
-    points = np.concatenate([frame.world(mask) for frame, mask in zip(frames, known, strict=True)])
+    points = np.concatenate([frame.world()[mask] for frame, mask in zip(frames, known, strict=True)])
     thin = captures._thin(frames, known)
     cells = {tuple(np.floor(p / 0.02).astype(int)) for p in points}
     assert len(thin) == len(cells) < len(points)
@@ -114,32 +122,39 @@ def test_a_cloud_keeps_one_known_point_of_a_cell():
 
 
 class MadeCapture:
-    """Frames of the plane with measured depth; the pipeline's depth is ``factor`` times the truth."""
+    """Frames of the plane with measured depth; the pipeline's depth is ``factor`` times ground truth."""
 
     def __init__(self, factors=(1.005, 1.1, 0.9), poses="given"):
         self.true, self.factors = make_frames(), factors
         self.names, self.asked, self.poses = [f.name for f in self.true], [], poses
         self.rng = np.random.default_rng(4)
         self.known = [self.rng.random(SIZE) > 0.2 for _ in self.true]
-        world = np.concatenate([f.world(np.arange(f.depth.size).reshape(SIZE) % 37 == 5) for f in self.true])
+        world = np.concatenate(
+            [f.world()[np.arange(f.depth.size).reshape(SIZE) % 37 == 5] for f in self.true]
+        )
         seen = []
         for i, frame in enumerate(self.true):
             chosen = np.arange(i, len(world), 2)
-            x = (world[chosen] - frame.E[:3, 3]) @ frame.E[:3, :3] @ frame.K.T
+            x = (world[chosen] - frame.camera.E[:3, 3]) @ frame.camera.E[:3, :3] @ frame.camera.K.T
             seen.append((x[:, :2] / x[:, 2:], chosen))
-        far = [f.E for f in self.true]
-        self.solved = SimpleNamespace(K=[f.K for f in self.true], E=far, seen=seen, points=1.05 * world)
+        far = [f.camera.E for f in self.true]
+        self.solved = SimpleNamespace(
+            K=[f.camera.K for f in self.true], E=far, seen=seen, points=1.05 * world
+        )
 
     def solve(self, poses="refined"):
         self.asked.append(poses)
         return self.solved
 
+    def camera(self, name):
+        return self.true[self.names.index(name)].camera
+
     def measured_depth(self, name):
         i = self.names.index(name)
         return np.where(self.known[i], self.true[i].depth, 0), self.known[i]
 
-    def depth(self, pipe, name, count, **told):
-        self.asked.append((pipe, name, count, told))
+    def depth(self, pipe, name, count, **reported):
+        self.asked.append((pipe, name, count, reported))
         i = self.names.index(name)
         depth = (self.factors[i] * self.true[i].depth)[None, ..., None]
         confidence = None if i == 2 else np.full((1, *SIZE, 1), 0.25 * (1 + i))
@@ -158,7 +173,7 @@ def test_a_row_of_the_table_is_the_mean_over_its_frames_and_of_frames_that_agree
 
     def agreed(frame, others):
         checked.append((frame.name, [other.name for other in others], float(frame.confidence[0, 0])))
-        return DepthFrame(frame.name, 1.01 * frame.depth, frame.confidence, frame.K, frame.E)
+        return posed_frame(frame.name, 1.01 * frame.depth, frame.confidence, frame.camera.K, frame.camera.E)
 
     monkeypatch.setattr(captures, "agreed", agreed)
     row = CAPTURE_ROWS["pairs"]
@@ -166,7 +181,7 @@ def test_a_row_of_the_table_is_the_mean_over_its_frames_and_of_frames_that_agree
         made, "pipe", row, 5, ["f2", "f0", "f1"], options(tmp_path, seed=9, steps=3)
     )
     assert made.asked[0] == "given"
-    call = {"seed": 9, "knobs": {"pose": "refine"}, "num_inference_steps": 3}
+    call = {"seed": 9, "parameters": {"pose": "refine"}, "num_inference_steps": 3}
     assert made.asked[1:] == [("pipe", name, 5, call) for name in ("f2", "f0", "f1")]
     assert checked == [("f2", ["f0", "f1"], 1.0), ("f0", ["f2", "f1"], 0.25), ("f1", ["f2", "f0"], 0.5)]
     assert record["abs_rel"] == pytest.approx((0.005 + 0.1 + 0.1) / 3) and record["worst"] == pytest.approx(
@@ -182,18 +197,20 @@ def test_a_row_of_the_table_is_the_mean_over_its_frames_and_of_frames_that_agree
     clouds = captures._thin(order, known), captures._thin(true, known)
     assert record["f"] == pytest.approx(captures.f_score(*clouds)) and 0 < record["f"] < 1
     captures._measure_frames(made, "pipe", CAPTURE_ROWS["capture"], 2, ["f1"], options(tmp_path))
-    assert made.asked[-2] == "refined" and made.asked[-1][3] == {"seed": 0, "knobs": {"pose": "given"}}
+    assert made.asked[-2] == "refined" and made.asked[-1][3] == {"seed": 0, "parameters": {"pose": "given"}}
 
 
 def test_sparse_points_are_scored_by_their_depth_in_each_camera():
     made = MadeCapture()
-    made.solved.points[3] = made.true[1].E[:3, 3] - 5.0 * made.true[1].E[:3, 2]  # behind the camera
+    made.solved.points[3] = (
+        made.true[1].camera.E[:3, 3] - 5.0 * made.true[1].camera.E[:3, 2]
+    )  # behind the camera
     record = captures._of_points(made, ["f1", "f2"])
     expected = []
     for i in (1, 2):
         frame, pixels, ratios = made.true[i], *made.solved.seen[i][:1], []
         for (x, y), at in zip(pixels, made.solved.seen[i][1], strict=True):
-            z = (np.linalg.inv(frame.E) @ [*made.solved.points[at], 1])[2]
+            z = (np.linalg.inv(frame.camera.E) @ [*made.solved.points[at], 1])[2]
             row, column = min(max(round(y), 0), SIZE[0] - 1), min(max(round(x), 0), SIZE[1] - 1)
             if made.known[i][row, column] and z > 0:
                 ratios.append(z / frame.depth[row, column])
@@ -220,8 +237,13 @@ def test_every_row_and_number_of_neighbours_is_a_cell_of_its_capture(tmp_path, m
     monkeypatch.setattr(captures, "run_experiment", lambda *given: run.append(given))
 
     def cells(**changes):
-        told = {"data": tuple(folders), "out": tmp_path, "neighbours": (2, 4), "rows": ("given", "capture")}
-        made = CaptureEvalOptions(**told | changes)
+        reported = {
+            "data": tuple(folders),
+            "out": tmp_path,
+            "neighbours": (2, 4),
+            "rows": ("given", "capture"),
+        }
+        made = CaptureEvalOptions(**reported | changes)
         captures.run_capture_eval("capture", made)
         name, given, experiment = run[-1]
         assert (name, given) == ("capture", made)
@@ -230,10 +252,10 @@ def test_every_row_and_number_of_neighbours_is_a_cell_of_its_capture(tmp_path, m
     experiment = cells()
     assert opened == [folders[0]] * 2 + [folders[1]] * 2
     heads = [cell.head for cell in experiment.cells]
-    titles = [("poses as given", "3"), ("poses as given", "5")]
+    titles = [("given poses", "3"), ("given poses", "5")]
     titles += [
-        ("solved over the capture", "3"),
-        ("solved over the capture", "5"),
+        ("refined over the capture", "3"),
+        ("refined over the capture", "5"),
         ("COLMAP's sparse points", "all"),
     ]
     assert heads == [{"data": str(f), "row": row, "views": n} for f in folders for row, n in titles]
@@ -262,7 +284,7 @@ def test_every_row_and_number_of_neighbours_is_a_cell_of_its_capture(tmp_path, m
     first, second = experiment.tables(records)
     assert (first.title, second.title) == ("one, 3 frames", "two, 3 frames")
     assert first.rows[0] == (
-        "poses as given",
+        "given poses",
         "3",
         *["0.5000"] * 3,
         *["0.500"] * 3,
@@ -276,7 +298,7 @@ def test_every_row_and_number_of_neighbours_is_a_cell_of_its_capture(tmp_path, m
     )
 
 
-def test_a_frame_without_measured_depth_is_refused_at_once(tmp_path, monkeypatch):
+def test_a_frame_without_measured_depth_is_rejected_at_once(tmp_path, monkeypatch):
     made = MadeCapture()
     made.measured_depth = lambda name: pytest.fail(name) if name == "f1" else None
     monkeypatch.setattr(captures, "Capture", SimpleNamespace(open=lambda data: made))

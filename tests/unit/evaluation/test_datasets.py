@@ -1,6 +1,7 @@
 """What readers of data sets take from a folder, which samples are selected, how samples are changed."""
 
 import json
+import re
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,17 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.evaluation import datasets
-from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, find_pairs, layouts, load, select
+from geodiff_plugin.evaluation.datasets import (
+    DATASETS,
+    SampleRef,
+    find_pairs,
+    in_split,
+    layouts,
+    load,
+    select,
+)
 from geodiff_plugin.evaluation.datasets import sample as module
 from geodiff_plugin.evaluation.datasets.sample import (
     ExtraView,
@@ -25,10 +35,12 @@ from geodiff_plugin.evaluation.datasets.sample import (
     two_numbers,
     with_drifted_rig,
     with_perturbed_poses,
+    with_scaled_rig,
 )
-from geodiff_plugin.evaluation.options import PairsOptions
+from geodiff_plugin.evaluation.datasets.splits import SPLITS, split_of
+from geodiff_plugin.evaluation.options import DirOptions, PairsOptions
 from geodiff_plugin.formats import write_pfm
-from geodiff_plugin.types import Rig
+from tests.views import made_rig
 
 SIZE = (12, 20)
 LARGE = (36, 52)
@@ -51,7 +63,7 @@ def test_the_protocol_of_every_set():
         *("mvsnet", "robustmvd", "folder"),
     ]
     caps = {name: dataset.cap_m for name, dataset in DATASETS.items() if dataset.cap_m is not None}
-    assert caps == {"kitti2015": 80.0, "kitti2012": 80.0, "booster": 10.0}
+    assert caps == {"kitti2015": 80.0, "kitti2012": 80.0, "booster": 10.0, "scannet": 10.0}
     posed = {name for name, dataset in DATASETS.items() if set(dataset.options) == {"pairs", "pixel_centre"}}
     assert posed == {"mvsnet", "robustmvd"}
     assert all(dataset.needs_folder for name, dataset in DATASETS.items() if name != "synthetic")
@@ -59,9 +71,9 @@ def test_the_protocol_of_every_set():
 
 def test_folders_are_listed_level_by_level_in_order(tmp_path):
     touch(tmp_path, "b/x/1/2/3/f", "a/y/f", "file")
-    found = [str(p.relative_to(tmp_path)) for p in layouts._folders(tmp_path, 2)]
+    found = [str(p.relative_to(tmp_path)) for p in module.folders(tmp_path, 2)]
     assert found == [".", "a", "b", "a/y", "b/x"]
-    assert len(layouts._folders(tmp_path, 1)) == 3 and layouts._folders(tmp_path / "file", 3) == []
+    assert len(module.folders(tmp_path, 1)) == 3 and module.folders(tmp_path / "file", 3) == []
 
 
 def test_kitti_takes_colour_and_all_pixels_where_they_are_there(tmp_path):
@@ -93,7 +105,7 @@ def test_kitti_takes_colour_and_all_pixels_where_they_are_there(tmp_path):
     assert find_pairs(tmp_path / "bare", ["kitti2015"]) == []
 
 
-def test_scenes_are_of_the_set_that_truth_and_folders_name(tmp_path):
+def test_scenes_are_of_the_set_that_ground_truth_and_folders_name(tmp_path):
     def scene(folder, *more):
         touch(tmp_path, f"{folder}/im0.png", f"{folder}/im1.png", f"{folder}/calib.txt", *more)
 
@@ -143,22 +155,22 @@ def test_a_quarter_of_an_image_is_the_mean_of_squares_and_keeps_its_rays():
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (24, 40, 3), dtype=np.uint8)
     K = np.array([[77.0, 0, 18.25], [0, 69.0, 13.75], [0, 0, 1]])
-    small, small_K = layouts._quartered(image, K)
+    small, camera = layouts._quartered(image, Camera(K))
     blocks = image.reshape(6, 4, 10, 4, 3).astype(float).mean((1, 3))
     np.testing.assert_array_equal(small, np.rint(blocks))
     # The centre of a square of four pixels from 4 i on is 4 i + 1.5.
     for u, v in ((3, 2), (9, 0)):
         ray = np.linalg.inv(K) @ [4 * u + 1.5, 4 * v + 1.5, 1]
-        np.testing.assert_allclose(np.linalg.inv(small_K) @ [u, v, 1], ray, rtol=1e-9)
+        np.testing.assert_allclose(np.linalg.inv(camera.K) @ [u, v, 1], ray, rtol=1e-9)
     values = np.arange(24 * 40).reshape(24, 40)
     np.testing.assert_array_equal(values[layouts._EVERY], values[2::4, 2::4])
 
 
-def test_the_step_of_truth_is_its_least_gap_if_that_is_coarse():
-    assert layouts._step_px(np.array([1.0, 3.0, 3.5, 1.0, 9.0])) == 0.5
-    assert layouts._step_px(np.array([1.0, 1.0 + 1 / 16, 3.0])) == 0.0
-    assert layouts._step_px(np.array([1.0, 1.07])) == pytest.approx(0.07)
-    assert layouts._step_px(np.array([4.0])) == layouts._step_px(np.array([])) == 0.0
+def test_the_step_of_ground_truth_is_its_smallest_gap_if_that_is_coarse():
+    assert module.step_px(np.array([1.0, 3.0, 3.5, 1.0, 9.0])) == 0.5
+    assert module.step_px(np.array([1.0, 1.0 + 1 / 16, 3.0])) == 0.0
+    assert module.step_px(np.array([1.0, 1.07])) == pytest.approx(0.07)
+    assert module.step_px(np.array([4.0])) == module.step_px(np.array([])) == 0.0
 
 
 def write_pair_txt(folder, text):
@@ -206,7 +218,7 @@ def test_posed_pairs_take_sources_in_order_and_at_most_four_further_views(tmp_pa
             find_pairs(tmp_path, ["mvsnet"])
 
 
-def test_the_benchmark_takes_its_key_views_and_counts_truth_from_one(tmp_path):
+def test_the_benchmark_uses_its_key_views_and_counts_ground_truth_from_one(tmp_path):
     folder = tmp_path / "Ignatius"
     write_pair_txt(folder, "2\n37\n2 12 9 40 8\n18\n1 17 9\n")
     assert [ref.dataset for ref in find_pairs(tmp_path)] == ["mvsnet"]  # without the benchmark's truth
@@ -218,7 +230,7 @@ def test_the_benchmark_takes_its_key_views_and_counts_truth_from_one(tmp_path):
     assert layouts.KEY_VIEWS["Ignatius"][::12] == (17, 257)
 
 
-def test_own_folders_prefer_png_and_say_what_is_missing(tmp_path):
+def test_own_folders_prefer_png_and_report_what_is_missing(tmp_path):
     touch(
         tmp_path,
         "a/left.jpg",
@@ -281,7 +293,7 @@ def test_own_depth_is_read_in_metres_with_its_holes(tmp_path, suffix):
     words = f"no depth.npy, depth.pfm, depth.png or depth_mm.png in {tmp_path}"
     assert sample.notes == {"truth": words}
     with pytest.raises(ValueError, match=r"known for at least one pixel; got none \(no depth.npy"):
-        sample.check_truth()
+        sample.check_ground_truth()
     if suffix == "npy":
         np.save(path, np.rint(1000 * depth).astype(np.int32))
         with pytest.raises(ValueError, match="int32"):
@@ -290,19 +302,19 @@ def test_own_depth_is_read_in_metres_with_its_holes(tmp_path, suffix):
 
 def test_a_file_of_another_size_is_named_with_both_sizes(tmp_path):
     with pytest.raises(ValueError, match=r"f.png must be for 20 x 12 pixels as the right image; got 12 x 20"):
-        layouts._check_size(Path("f.png"), (20, 12), (12, 20, 3), "right")
-    layouts._check_size(Path("f.png"), (12, 20), (12, 20, 3))
+        module.check_size(Path("f.png"), (20, 12), (12, 20, 3), "right")
+    module.check_size(Path("f.png"), (12, 20), (12, 20, 3))
     values = np.ones(SIZE)
-    assert layouts._like(np.ones((*SIZE, 3)), Path("f"), values) is values
+    assert module.like(np.ones((*SIZE, 3)), Path("f"), values) is values
 
 
 @pytest.mark.parametrize("second", [None, Path("b.txt")])
 def test_calibrations_are_read_for_the_names_and_the_size_of_the_images(monkeypatch, second):
-    """The left image is 20 x 12 pixels, the right one 30 x 16; a calibration of other sizes is refused."""
+    """The left image is 20 x 12 pixels, the right one 30 x 16; a calibration of other sizes is rejected."""
     images = {Path("l.png"): np.zeros((12, 20, 3), np.uint8), Path("r.png"): np.zeros((16, 30, 3), np.uint8)}
     monkeypatch.setattr(layouts, "read_rgb", lambda path, name: images[path])
-    asked, sizes = [], {"size_left": (20, 12), "size_right": (30, 16)}
-    rig = Rig(np.eye(3), np.eye(3), np.eye(4), **sizes)
+    asked, sizes = [], ((20, 12), (30, 16))
+    rig = made_rig(np.eye(3), np.eye(3), np.eye(4), sizes)
     monkeypatch.setattr(
         layouts, "read_calibration", lambda *given, **more: asked.append((given, more)) or rig
     )
@@ -314,7 +326,8 @@ def test_calibrations_are_read_for_the_names_and_the_size_of_the_images(monkeypa
     named = {"image_names": ("l.png", "r.png"), "image_size": (20, 12)}
     assert asked == [((paths, (2, 3), "l.png"), named)]
     for side, file in (("left", "a.txt"), ("right", "a.txt" if second is None else "b.txt")):
-        rig = Rig(np.eye(3), np.eye(3), np.eye(4), **sizes | {f"size_{side}": (12, 20)})
+        turned = ((12, 20), sizes[1]) if side == "left" else (sizes[0], (12, 20))
+        rig = made_rig(np.eye(3), np.eye(3), np.eye(4), turned)
         with pytest.raises(
             ValueError, match=f"{file} must be for .* pixels as the {side} image; got 12 x 20"
         ):
@@ -352,7 +365,7 @@ def random_sample(rectified=True) -> StereoSample:
         cv2.GaussianBlur(rng.integers(0, 255, (*s, 3), dtype=np.uint8), (5, 5), 2) for s in (SIZE, (40, 60))
     )
     K = K_LEFT if rectified else K_LEFT * [[1], [1.1], [1]]
-    return make_sample(SampleRef("d", "n", {}), images, Rig(K_LEFT, K, E), depth, {"truth": "t"})
+    return make_sample(SampleRef("d", "n", {}), images, made_rig(K_LEFT, K, E), depth, {"truth": "t"})
 
 
 def test_a_made_sample_holds_what_it_is_given_and_zero_for_unknown_depth():
@@ -362,7 +375,7 @@ def test_a_made_sample_holds_what_it_is_given_and_zero_for_unknown_depth():
         assert not sample.valid[:3].any() and sample.valid[3:].all()
         assert (sample.depth_m[:3] == 0).all() and sample.depth_m.dtype == np.float32
         assert sample.left.shape == (*SIZE, 3) and sample.right.shape == (40, 60, 3)
-        assert sample.E_scored is sample.E and sample.check_truth() is sample
+        assert sample.E_scored is sample.E and sample.check_ground_truth() is sample
         assert (sample.occluded, sample.material, sample.extra_views, sample.E_true) == (None, None, (), None)
         other = replace(sample, E_true=2 * sample.E)
         assert other.E_scored is other.E_true
@@ -370,14 +383,14 @@ def test_a_made_sample_holds_what_it_is_given_and_zero_for_unknown_depth():
     assert StereoSample("d", "n", **given, depth_m=sample.depth_m, valid=sample.valid).rectified is False
 
 
-@pytest.mark.parametrize(("degrees", "share"), [(12.0, 0.5), (3.0, 0.05)])
-def test_wrong_poses_are_within_what_was_asked_keep_the_baseline_and_are_of_two_kinds(degrees, share):
+@pytest.mark.parametrize(("degrees", "fraction"), [(12.0, 0.5), (3.0, 0.05)])
+def test_wrong_poses_are_within_what_was_asked_keep_the_baseline_and_are_of_two_kinds(degrees, fraction):
     sample = random_sample(rectified=False)
     view = ExtraView(sample.right, K_RIGHT, np.linalg.inv(sample.E))
     sample = replace(sample, extra_views=(view,))
     depth, kinds, turns = float(np.median(sample.depth_m[sample.valid])), [], []
     for name in map(str, range(24)):
-        wrong = with_perturbed_poses(sample, (degrees, share), name)
+        wrong = with_perturbed_poses(sample, (degrees, fraction), name)
         assert wrong.name == name and wrong.E_true is sample.E and wrong.E_scored is sample.E
         assert wrong.extra_views[0].image is view.image and wrong.extra_views[0].K is view.K
         for E, given in ((sample.E, wrong.E), (view.E, wrong.extra_views[0].E)):
@@ -388,14 +401,14 @@ def test_wrong_poses_are_within_what_was_asked_keep_the_baseline_and_are_of_two_
             turns.append(np.degrees(np.linalg.norm(turn)))
             # The direction of the moved centre, in the camera, up to its length.
             ideal = -np.cross(turn, (0, 0, depth))
-            ideal *= min(1.0, share * baseline / np.linalg.norm(ideal))
+            ideal *= min(1.0, fraction * baseline / np.linalg.norm(ideal))
             moved = E[:3, 3] + E[:3, :3] @ ideal
             kinds.append(np.allclose(given[:3, 3], moved * baseline / np.linalg.norm(moved), atol=1e-9))
             angle = np.arccos(np.clip(E[:3, 3] @ given[:3, 3] / baseline**2, -1, 1))
-            assert angle <= np.arcsin(share) + 1e-6
+            assert angle <= np.arcsin(fraction) + 1e-6
     assert 0.3 * degrees - 1e-9 <= min(turns) < 0.4 * degrees and 0.9 * degrees < max(turns) <= degrees + 1e-9
     assert 10 < sum(kinds) < 38
-    again = with_perturbed_poses(wrong, (degrees, share), "again")
+    again = with_perturbed_poses(wrong, (degrees, fraction), "again")
     assert again.E_true is sample.E
 
 
@@ -455,7 +468,7 @@ def test_two_numbers_are_read_within_their_ranges(text, option, expected):
         assert two_numbers(text, option) == expected
         return
     words = (
-        r"DEGREES,SHARE.*\[0, 30\] and \[0, 0.9\]"
+        r"DEGREES,FRACTION.*\[0, 30\] and \[0, 0.9\]"
         if option == "--perturb"
         else r"DEGREES,PIXELS.*\[0, 5\] and \[0, 20\]"
     )
@@ -473,12 +486,12 @@ def options(**changes):
 def test_scenes_then_a_draw_then_the_limit_then_wrong_poses(monkeypatch):
     asked = []
     monkeypatch.setattr(datasets, "find_pairs", lambda *given, **more: asked.append((*given, more)) or REFS)
-    told = {"scenes": ("room",), "sample": 4, "limit": 2, "perturb": "2,0.5", "seed": 3}
+    reported = {"scenes": ("room",), "sample": 4, "limit": 2, "perturb": "2,0.5", "seed": 3}
     drawn = [r.name for r in select(options(scenes=("room",), sample=4, seed=3))]
     assert len(drawn) == 4 and drawn == sorted(drawn) and {n[:4] for n in drawn} == {"room"}
     assert asked[-1] == (Path("data"), None, {"pairs": "default", "pixel_centre": None})
-    assert [r.name for r in select(options(**told))] == [f"{n}-turn2-shift0.5" for n in drawn[:2]]
-    assert select(options(**told))[0].files == {"perturbed": (2.0, 0.5)}
+    assert [r.name for r in select(options(**reported))] == [f"{n}-turn2-shift0.5" for n in drawn[:2]]
+    assert select(options(**reported))[0].files == {"perturbed": (2.0, 0.5)}
     assert select(options()) == REFS and select(options(limit=3)) == REFS[:3]
     assert len({tuple(r.name for r in select(options(sample=4, seed=s))) for s in range(5)}) > 1
     assert select(options(scenes=("room1", "d/yard2"))) == [REFS[2], REFS[5]]
@@ -493,7 +506,7 @@ def test_scenes_then_a_draw_then_the_limit_then_wrong_poses(monkeypatch):
     assert asked[-1][0] == DEMO_PAIR_FOLDER
 
 
-def test_no_sample_and_two_of_one_name_are_refused():
+def test_no_sample_and_two_of_one_name_are_rejected():
     with pytest.raises(
         ValueError, match=r"a folder with a sample with cave in its name; got f with d/room0, d/yard0"
     ):
@@ -518,4 +531,65 @@ def test_samples_are_changed_as_their_reference_asks(monkeypatch):
     drifted = changed_ref(ref, "drifted", (0.5, 2))
     load(drifted)
     assert changed == [("drifted", sample, (0.5, 2), "n-drift0.5-2px")]
-    assert json.dumps([*module.CHANGES]) == '["perturbed", "drifted"]'
+    assert json.dumps([*module.CHANGES]) == '["perturbed", "drifted", "scaled"]'
+
+
+@pytest.mark.parametrize(("factor", "zoom"), [(0.5, 1.0), (2.0, 1.0), (1.0, 0.5), (3.0, 2.0)])
+def test_a_scaled_rig_shows_the_same_pixels_of_a_scaled_scene(factor, zoom):
+    """A point of the scaled scene is seen in the right image at the resized place of the original point."""
+    sample = random_sample(rectified=False)
+    view = ExtraView(sample.right, K_RIGHT, np.linalg.inv(sample.E))
+    sample = replace(sample, extra_views=(view,))
+    scaled = with_scaled_rig(sample, (factor, zoom), "new")
+    assert scaled.name == "new" and scaled.left is sample.left and scaled.E_scored is scaled.E
+    assert scaled.right.shape == (round(40 * zoom), round(60 * zoom), 3)
+    np.testing.assert_allclose(scaled.depth_m, factor * sample.depth_m, rtol=1e-6)
+    point = np.array([0.2, -0.1, 2.5])
+
+    def project(K, E, point):
+        u, v, w = K @ (np.linalg.inv(E) @ [*point, 1])[:3]
+        return np.array([u / w, v / w])
+
+    before = project(sample.K_right, sample.E, point)
+    after = project(scaled.K_right, scaled.E, factor * point)
+    np.testing.assert_allclose(after + 0.5, zoom * (before + 0.5), atol=1e-9)
+    assert scaled.extra_views[0].K is K_RIGHT
+    np.testing.assert_allclose(
+        project(K_RIGHT, scaled.extra_views[0].E, factor * point), project(K_RIGHT, view.E, point), atol=1e-9
+    )
+    assert with_scaled_rig(random_sample(), (factor, zoom), "n").rectified == (zoom == 1)
+
+
+def test_no_pair_is_in_both_splits_or_twice_in_one():
+    listed = [(dataset, name) for split in SPLITS.values() for dataset in split for name in split[dataset]]
+    assert len(set(listed)) == len(listed)
+    assert {dataset for dataset, _ in listed} <= set(DATASETS)
+    assert split_of("kitti2012", "000013") == "tuned" and split_of("kitti2012", "000015") == "unseen"
+    assert split_of("kitti2012", "000014") is None and split_of("folder", "000015") is None
+
+
+def test_the_thirteen_pairs_of_the_results_are_the_tuned_ones():
+    assert sum(map(len, SPLITS["tuned"].values())) == 13
+
+
+def test_unseen_scenes_are_those_of_the_downloads():
+    unseen = SPLITS["unseen"]
+    assert {name: len(scenes) for name, scenes in unseen.items()} == {
+        **{"kitti2015": 20, "kitti2012": 19, "eth3d": 25, "middlebury2021": 24},
+        **{"middlebury2001": 6, "middlebury2003": 2, "middlebury2005": 6, "middlebury2006": 21},
+    }
+    assert {re.sub(r"\d", "", name) for name in unseen["middlebury2021"]} == set(layouts._SCENES_2021)
+    assert all(re.fullmatch(r"0001\d5|0000\d5", name) for name in unseen["kitti2012"] + unseen["kitti2015"])
+    assert not any(name.startswith("terrace") for name in unseen["eth3d"])  # the place of a tuned pair
+
+
+def test_a_split_selects_its_pairs_and_names_what_was_found_instead(tmp_path):
+    refs = [SampleRef("kitti2012", name, {}) for name in ("000000", "000005", "000006")]
+    options = DirOptions(data=tmp_path, split="unseen")
+    assert [ref.name for ref in select(options, refs)] == ["000005"]
+    assert [ref.name for ref in select(DirOptions(data=tmp_path, split="tuned"), refs)] == ["000000"]
+    assert len(select(DirOptions(data=tmp_path), refs)) == 3
+    with pytest.raises(ValueError, match=r"of the split 'unseen'; got .*kitti2012/000000.*splits\.toml"):
+        in_split(refs[:1], "unseen", tmp_path)
+    with pytest.raises(ValueError, match="--split must be one of all, tuned, unseen"):
+        DirOptions(data=tmp_path, split="test")

@@ -18,17 +18,17 @@ from geodiff_plugin.evaluation.baselines import Method, NotApplicable, Predictio
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.datasets.sample import make_sample
 from geodiff_plugin.evaluation.options import FigureOptions
-from geodiff_plugin.types import Rig
 from tests.tiny import plane_pair
+from tests.views import made_rig
 
 
 @pytest.fixture(scope="module")
 def sample():
-    """A plane from about 1.4 m to 3.4 m, some of whose truth is unknown."""
+    """A plane from about 1.4 m to 3.4 m, some of whose ground truth is unknown."""
     pair = plane_pair(rotation_y=0.05)
     depth_m = pair.depth_m.copy()
     depth_m[:5, :9] = 0
-    rig = Rig(pair.K, pair.K, pair.E)
+    rig = made_rig(pair.K, pair.K, pair.E)
     return make_sample(SampleRef("d", "s", {}), (pair.left, pair.right), rig, depth_m, {})
 
 
@@ -92,7 +92,7 @@ METHODS = {"half": 0.5, "twice": 2.0, "never": None, "holes": math.nan}
 
 @pytest.fixture
 def methods(monkeypatch):
-    """Methods that scale the truth, one that cannot and one that answers nowhere."""
+    """Methods that scale ground truth, one that cannot and one that answers nowhere."""
 
     def run(factor, sample, settings, priors):
         if factor is None:
@@ -114,35 +114,43 @@ def test_answers_have_the_error_in_their_title(sample, methods):
 
 
 @pytest.mark.parametrize("clouds", [False, True])
-def test_a_sample_is_shown_with_depth_truth_errors_and_clouds_on_one_scale(
+def test_a_sample_is_shown_with_depth_ground_truth_errors_and_clouds_on_one_scale(
     sample, methods, monkeypatch, clouds
 ):
     depths, errors, views = [], [], []
     monkeypatch.setattr(
         figures, "colour_depth", lambda m, near, far: depths.append((m, near, far)) or "depth"
     )
-    monkeypatch.setattr(figures, "colour_share", lambda e, most: errors.append((e, most)) or "error")
+    monkeypatch.setattr(figures, "colour_fraction", lambda e, most: errors.append((e, most)) or "error")
     monkeypatch.setattr(figures, "render_cloud", lambda m, *more: views.append((m, *more)) or "cloud")
     answers = [figures._answer(sample, name, Settings(), None) for name in ("half", "twice")]
-    pictures, titles = figures._rows(sample, answers, clouds)
-    truth = np.where(sample.valid, sample.depth_m, np.nan)
-    assert pictures[0] is sample.left
-    assert pictures[1:] == ["depth"] * 3 + ["error"] * 2 + ["cloud"] * 3 * clouds
+    rgb_images, titles = figures._rows(sample, answers, clouds)
+    ground_truth = np.where(sample.valid, sample.depth_m, np.nan)
+    assert rgb_images[0] is sample.left
+    assert rgb_images[1:] == ["depth"] * 3 + ["error"] * 2 + ["cloud"] * 3 * clouds
     for (shown, near, far), wanted in zip(
-        depths, (answers[0].depth_m, answers[1].depth_m, truth), strict=True
+        depths, (answers[0].depth_m, answers[1].depth_m, ground_truth), strict=True
     ):
         np.testing.assert_array_equal(shown, wanted)
-        assert np.nanmin(truth) <= near < np.nanquantile(truth, 0.1) < np.nanquantile(truth, 0.9) < far
+        assert (
+            np.nanmin(ground_truth)
+            <= near
+            < np.nanquantile(ground_truth, 0.1)
+            < np.nanquantile(ground_truth, 0.9)
+            < far
+        )
     for (error, most), wanted in zip(errors, (0.5, 1.0), strict=True):
         np.testing.assert_allclose(error[sample.valid], wanted, rtol=1e-6)
         assert np.isnan(error[~sample.valid]).all() and most == 0.5
     assert titles[:4] == ["s", "Half, AbsRel 0.500", "Twice, AbsRel 1.000", titles[3]]
-    assert titles[3] == f"truth, {depths[0][1]:.3g} m to {depths[0][2]:.3g} m"
+    assert titles[3] == f"ground truth, {depths[0][1]:.3g} m to {depths[0][2]:.3g} m"
     assert (
         titles[4:6] == ["error, 0 to 50% of the depth"] * 2
-        and titles[6:] == ["from the left, above"] * 3 * clouds
+        and titles[6:] == ["view from above left"] * 3 * clouds
     )
-    for (m, image, K, T), wanted in zip(views, (truth, answers[0].depth_m, answers[1].depth_m), strict=False):
+    for (m, image, K, T), wanted in zip(
+        views, (ground_truth, answers[0].depth_m, answers[1].depth_m), strict=False
+    ):
         np.testing.assert_array_equal(m, wanted)
         assert image is sample.left and K is sample.K_left
         np.testing.assert_allclose(T, figures.orbit(np.median(sample.depth_m[sample.valid])))
@@ -157,7 +165,7 @@ def test_side_by_side_draws_every_sample_with_every_method(sample, methods, monk
         lambda ref: make_sample(
             SampleRef("d", ref, {}),
             (sample.left, sample.right),
-            Rig(sample.K_left, sample.K_right, sample.E),
+            made_rig(sample.K_left, sample.K_right, sample.E),
             sample.depth_m,
             {},
         ),
@@ -166,7 +174,7 @@ def test_side_by_side_draws_every_sample_with_every_method(sample, methods, monk
     given = FigureOptions(name="qualitative", out=tmp_path)
     drawing = figures.draw_side_by_side(("half", "never", "twice"), given)
     cells, titles, more = gridded[0]
-    assert more == {"columns": 4} and len(cells) == len(titles) == 2 * 8 and drawing.picture == "grid"
+    assert more == {"columns": 4} and len(cells) == len(titles) == 2 * 8 and drawing.rgb == "grid"
     half, never, twice = pytest.approx(0.5), None, pytest.approx(1.0)
     expected = {f"d/{r}": {"half": half, "never": never, "twice": twice} for r in ("r1", "r2")}
     assert drawing.numbers == {"abs_rel": expected} and titles[0] == "r1" and titles[8] == "r2"
@@ -175,12 +183,39 @@ def test_side_by_side_draws_every_sample_with_every_method(sample, methods, monk
     assert gridded[1][2] == {"columns": 2} and len(gridded[1][0]) == 2 * (1 + 2 + 1 + 2)
 
 
+def test_a_risk_coverage_figure_draws_the_mean_curve_of_each_method_and_the_best_order(monkeypatch, tmp_path):
+    curves = {"guided": ([0.4, 0.2], [0.4, 0.0]), "fast": ([0.6, 0.5], [0.6, 0.1])}
+
+    def records(options, refs, methods):
+        assert methods == ["guided", "fast"]
+        found = []
+        for method, (risk, oracle) in curves.items():
+            for i, factor in enumerate((0.5, 1.5)):  # their mean is 1
+                curve = {"risk": [factor * x for x in risk], "oracle": [factor * x for x in oracle]}
+                head = {"method": method, "dataset": "d", "sample": f"s{i}", "status": "ok"}
+                found.append(head | {"risk_coverage": curve})
+        return found
+
+    monkeypatch.setattr(figures, "select", lambda options: [SampleRef("d", f"s{i}", {}) for i in range(2)])
+    monkeypatch.setattr(figures, "_records", records)
+    drawing = figures.draw_risk_coverage(FigureOptions(name="risk-coverage", out=tmp_path))
+    (axes,) = drawing.rgb.axes
+    lines = iter(axes.lines)
+    for method, (risk, oracle) in curves.items():
+        for values, label in ((risk, method), (oracle, "ordered by error")):
+            line = next(lines)
+            np.testing.assert_allclose(line.get_xydata(), np.c_[(100, 50), values])
+            assert line.get_label() == label
+        assert drawing.numbers["curves"][method]["risk"] == pytest.approx(risk)
+    assert axes.get_ylim()[0] == 0 and "coverage" in axes.get_xlabel()
+
+
 def test_curves_of_updates_are_means_in_order_with_bands_where_there_are_five(monkeypatch, tmp_path):
     asked, count = [], 6
     refs = [SampleRef("d", f"s{i}", {}) for i in range(count)]
 
     def error(method, i):
-        preset, _, updates = method.partition(":inner_steps=")
+        preset, _, updates = method.partition(":guidance_steps=")
         return (0.1 if preset == "guided" else 0.3) + 0.01 * int(updates) + 0.001 * i
 
     def records(options, refs, methods):
@@ -188,7 +223,7 @@ def test_curves_of_updates_are_means_in_order_with_bands_where_there_are_five(mo
         found = []
         for method in methods:
             for i in range(count):
-                ok = method != "paper:inner_steps=9" or i < 3
+                ok = method != "paper:guidance_steps=9" or i < 3
                 e = error(method, i)
                 scores = {"raw": {"abs_rel": e}, "aligned": {"abs_rel": 9}}
                 status = {"status": "ok"} if ok else {"status": "broken"}
@@ -197,32 +232,32 @@ def test_curves_of_updates_are_means_in_order_with_bands_where_there_are_five(mo
 
     monkeypatch.setattr(figures, "select", lambda options: refs)
     monkeypatch.setattr(figures, "_records", records)
-    given = FigureOptions(name="inner-steps", updates=(9, 2, 2, 5), out=tmp_path)
-    drawing = figures.draw_inner_steps(given)
-    methods = [f"{preset}:inner_steps={n}" for preset in ("guided", "paper") for n in (2, 5, 9)]
+    given = FigureOptions(name="guidance-steps", updates=(9, 2, 2, 5), out=tmp_path)
+    drawing = figures.draw_guidance_steps(given)
+    methods = [f"{preset}:guidance_steps={n}" for preset in ("guided", "paper") for n in (2, 5, 9)]
     assert asked == [(given, refs, methods)]
     assert drawing.numbers["updates"] == [2, 5, 9] and drawing.numbers["samples"] == [
         f"d/s{i}" for i in range(6)
     ]
-    left, right = drawing.picture.axes
+    left, right = drawing.rgb.axes
     for preset, line, seconds, colour in zip(
         ("guided", "paper"), left.lines, right.lines, ("#0072B2", "#D55E00"), strict=True
     ):
         wanted = []
         for n in (2, 5, 9):
             number = 3 if (preset, n) == ("paper", 9) else count
-            wanted.append(np.mean([error(f"{preset}:inner_steps={n}", i) for i in range(number)]))
+            wanted.append(np.mean([error(f"{preset}:guidance_steps={n}", i) for i in range(number)]))
         assert drawing.numbers[preset]["abs_rel"] == pytest.approx(wanted)
         assert drawing.numbers[preset]["seconds"] == pytest.approx([100 * w for w in wanted])
         np.testing.assert_allclose(line.get_xydata(), np.c_[(2, 5, 9), wanted])
         np.testing.assert_allclose(seconds.get_ydata(), 100 * np.array(wanted))
         assert line.get_label() == preset and to_rgb(line.get_color()) == to_rgb(colour)
     assert len(left.collections) == len(right.collections) == 1  # of three pairs there is no interval
-    assert (left.get_ylabel(), right.get_ylabel()) == ("AbsRel", "seconds a pair")
+    assert (left.get_ylabel(), right.get_ylabel()) == ("AbsRel", "s/pair")
     assert left.get_xlabel() == "updates per denoising step" and left.get_xscale() == "log"
     assert [t.get_text() for t in left.get_xticklabels()] == ["2", "5", "9"]
     assert left.get_ylim()[0] == right.get_ylim()[0] == 0
-    assert drawing.picture.get_suptitle() == "6 pairs" and right.get_legend() and not left.get_legend()
+    assert drawing.rgb.get_suptitle() == "6 pairs" and right.get_legend() and not left.get_legend()
     assert left.lines[0].get_marker() != left.lines[1].get_marker()
 
 
@@ -233,14 +268,14 @@ def test_the_sweep_is_drawn_with_both_optima_and_written(sample, monkeypatch, tm
     monkeypatch.setattr(figures, "select", lambda options: ["first", "second"])
     monkeypatch.setattr(figures, "load", {"first": sample}.__getitem__)
     drawn = []
-    monkeypatch.setattr(figures, "_save_png", lambda picture, path: drawn.append((picture, path)))
+    monkeypatch.setattr(figures, "_save_png", lambda rgb, path: drawn.append((rgb, path)))
     path = figures.run_figure("figure", FigureOptions(name="gs-sweep", max=12.0, out=tmp_path))
     assert path == tmp_path / "figure-gs-sweep.png" and drawn[0][1] == path
     numbers = json.loads(path.with_suffix(".json").read_text())
     assert numbers["sample"] == "d/s" and len(numbers["loss"]) == 80 and "--max 12.0" in numbers["command"]
     g_s, loss, abs_rel = (np.array(numbers[name]) for name in ("g_s_m", "loss", "abs_rel"))
     assert g_s[-1] == pytest.approx(12) and g_s[abs_rel.argmin()] == pytest.approx(3, rel=0.03)
-    upper, lower, *pictures = drawn[0][0].axes
+    upper, lower, *rgb_images = drawn[0][0].axes
     for axes, values, name in ((upper, loss, "L_geo (visible)"), (lower, abs_rel, "AbsRel")):
         curve, least_loss, least_error = axes.lines
         np.testing.assert_allclose(curve.get_xydata(), np.c_[g_s, values], rtol=1e-6)
@@ -248,15 +283,17 @@ def test_the_sweep_is_drawn_with_both_optima_and_written(sample, monkeypatch, tm
         assert least_error.get_xdata()[0] == g_s[abs_rel.argmin()] and axes.get_xscale() == "log"
         assert axes.get_xlim() == pytest.approx((0.95 * g_s[0], 1.05 * g_s[-1]))
     texts = [text.get_text() for text in upper.get_legend().get_texts()]
-    assert texts[0].startswith("least L_geo: g_s = ") and texts[1].startswith("least AbsRel: g_s = ")
-    assert lower.get_yscale() == "log" and lower.get_xlabel() == "global scale g_s, m" and len(pictures) == 5
-    assert pictures[0].get_title() == "left image"
-    np.testing.assert_array_equal(pictures[0].images[0].get_array(), sample.left)
-    last = pictures[-1].get_title()
+    assert texts[0].startswith("min L_geo: g_s = ") and texts[1].startswith("min AbsRel: g_s = ")
+    assert (
+        lower.get_yscale() == "log" and lower.get_xlabel() == "global scale g_s, m" and len(rgb_images) == 5
+    )
+    assert rgb_images[0].get_title() == "left image"
+    np.testing.assert_array_equal(rgb_images[0].images[0].get_array(), sample.left)
+    last = rgb_images[-1].get_title()
     assert last == f"g_s = 12 m\n{numbers['visible'][-1]:.0%} in view"
 
 
-def test_pictures_and_figures_are_written_as_png(tmp_path):
+def test_images_and_figures_are_written_as_png(tmp_path):
     pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
     figures._save_png(Image.fromarray(pixels), tmp_path / "new" / "a.png")
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "new" / "a.png")), pixels)
@@ -273,7 +310,7 @@ def test_pictures_and_figures_are_written_as_png(tmp_path):
 def test_records_of_a_figure_are_measured_from_its_cells(monkeypatch, tmp_path):
     monkeypatch.setattr(figures, "method_cells", lambda *given: given)
     monkeypatch.setattr(figures, "measure_cells", lambda cells, options: [cells, options])
-    given = FigureOptions(name="inner-steps", out=tmp_path)
+    given = FigureOptions(name="guidance-steps", out=tmp_path)
     (((refs, methods, settings, out), options),) = [figures._records(given, ["r"], ["m"])]
     assert (refs, methods, out, options) == (["r"], ["m"], tmp_path, given) and settings == given.settings
     monkeypatch.setattr(figures, "measure_cells", lambda cells, options: None)

@@ -20,9 +20,10 @@ from geodiff_plugin.evaluation.options import (
     PosesOptions,
     command_line,
 )
-from geodiff_plugin.options import OTHERS, OUTPUT, PRIOR, SAMPLES, flag_of, rules_of
+from geodiff_plugin.options import OUTPUT, PRIOR, SAMPLES
+from geodiff_plugin.settings import DEFAULT_SECTION, settings_of
 
-#: By command: its options beside those that all have, each with its default.
+#: By command: its options next to those that all have, each with its default.
 COMMON = {"seed": 0, "steps": None, "results": None, "quiet": False, "prior": "bundled", "dtype": "float32"}
 OF_SAMPLES = COMMON | {
     **{"data": None, "methods": (), "datasets": (), "scenes": (), "limit": None, "ensemble": 1},
@@ -30,13 +31,14 @@ OF_SAMPLES = COMMON | {
 }
 OF_PAIRS = OF_SAMPLES | {
     **{"sample": None, "pairs": "default", "pixel_centre": None, "stop_on_broken": False},
-    **{"skip_broken": False, "save_depth": False},
+    **{"save_depth": False},
 }
 PEERS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 DEFAULTS = {
     **dict.fromkeys(("table1", "table2", "table3", "ablation"), OF_PAIRS | {"ensemble": 10}),
-    **dict.fromkeys(("parts", "flatness", "cost"), OF_PAIRS),
-    "pairs": OF_PAIRS | {"data": MISSING, "methods": PEERS, "engine": "local", "workers": None, "gpus": None},
+    **dict.fromkeys(("parts", "flatness", "cost", "baseline"), OF_PAIRS),
+    "pairs": OF_PAIRS
+    | {"data": MISSING, "methods": PEERS, "split": "all", "engine": "local", "workers": None, "gpus": None},
     "figure": OF_SAMPLES
     | {"name": MISSING, "max": 80.0, "updates": (1, 2, 5, 10, 20, 40), "clouds": False, "results": None},
     "poses": COMMON
@@ -63,6 +65,7 @@ def test_the_commands_are_the_documented_ones_and_call_their_functions(monkeypat
     )
     where = {"pairs": "pairs.run_pairs", "cost": "pairs.run_cost", "figure": "figures.run_figure"}
     where |= {"poses": "poses.run_poses", "capture": "captures.run_capture_eval"}
+    where["baseline"] = "baseline_scale.run_baseline_scale"
     where |= dict.fromkeys(("table1", "table2", "table3", "ablation"), "paper.run_paper_table")
     where |= dict.fromkeys(("parts", "flatness"), "pairs.run_changes")
     assert set(COMMANDS) == set(where) == set(DEFAULTS)
@@ -104,7 +107,7 @@ NEEDED = {CaptureEvalOptions: {"data": (Path("d"),)}, FigureOptions: {"name": "g
 
 
 @pytest.mark.parametrize(("cls", "name", "good", "bad"), RANGES)
-def test_values_out_of_range_are_refused_by_their_flag(cls, name, good, bad):
+def test_values_out_of_range_are_rejected_by_their_flag(cls, name, good, bad):
     given = NEEDED.get(cls, {})
     for value in good:
         assert getattr(cls(**given, **{name: value}), name) == value
@@ -126,13 +129,13 @@ def test_methods_are_given_every_setting(monkeypatch):
     monkeypatch.setattr(
         "geodiff_plugin.runtime.machine.pick_device", lambda name: asked.append(name) or "cuda:1"
     )
-    told = {"prior": "x/y", "ensemble": 3, "seed": 5, "steps": 7, "resolution": 640, "dtype": "float16"}
-    told |= {"space": "log", "views": 4, "graphs": True, "no_kernels": True}
-    given = PairsOptions(**told)
-    assert given.settings == Settings(**told, device="cuda:1") and asked == [given.device]
+    reported = {"prior": "x/y", "ensemble": 3, "seed": 5, "steps": 7, "resolution": 640, "dtype": "float16"}
+    reported |= {"space": "log", "views": 4, "cuda_graphs": True, "no_triton": True}
+    given = PairsOptions(**reported)
+    assert given.settings == Settings(**reported, device="cuda:1") and asked == [given.device]
     default = PosesOptions().settings
     assert default == Settings(device="cuda:1")
-    assert {f.name for f in fields(Settings)} == {*told, "device"}
+    assert {f.name for f in fields(Settings)} == {*reported, "device"}
 
 
 def samples_of(cls):
@@ -141,7 +144,7 @@ def samples_of(cls):
         **{"prior": "x/y", "data": Path("my data"), "methods": ("a", "b"), "datasets": ("k", "l"), "seed": 5},
         **{"scenes": ("s",), "limit": 2, "ensemble": 3, "resolution": 640, "views": 4, "perturb": "1,0.2"},
         **{"sample": 6, "pairs": "all", "pixel_centre": 0.5, "steps": 9, "dtype": "float16", "space": "log"},
-        **{"graphs": True, "no_kernels": True, "name": "ablation", "max": 20.0, "updates": (3, 4)},
+        **{"cuda_graphs": True, "no_triton": True, "name": "ablation", "max": 20.0, "updates": (3, 4)},
         **{
             "clouds": True,
             "exact": Path("e"),
@@ -163,26 +166,28 @@ def test_the_command_line_names_all_that_changes_a_number(cls):
     words = shlex.split(command_line("NAME", cls(**values)))
     assert words[:3] == ["geodiff", "eval", "NAME"]
     found, positional = {}, []
-    flags = {flag_of(f): f for f in fields(cls)}
+    options = settings_of(cls)
+    names = {option.flag: name for name, option in options.items()}
     words = words[3:]
     while words:
         word = words.pop(0)
-        if word not in flags:
+        if word not in names:
             positional.append(word)
             continue
-        value = getattr(cls(**values), flags[word].name)
-        found[flags[word].name] = None if value is True else words.pop(0)
-    for f in fields(cls):
-        value, rules = values.get(f.name), rules_of(f)
-        if f.name not in values or f.name in CHANGE_NO_NUMBER:
-            assert f.name not in found
-        elif rules.is_argument:
+        value = getattr(cls(**values), names[word])
+        found[names[word]] = None if value is True else words.pop(0)
+    for name, option in options.items():
+        value = values.get(name)
+        if name not in values or name in CHANGE_NO_NUMBER:
+            assert name not in found
+        elif option.is_argument:
             each = value if isinstance(value, tuple) else (value,)
             assert {str(part) for part in each} <= set(positional)
         else:
             text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-            assert found[f.name] == (None if value is True else text)
-    given = {f.name: values[f.name] for f in fields(cls) if f.default is MISSING and f.name in values}
+            assert found[name] == (None if value is True else text)
+    needed = {name for name, option in options.items() if option.default is MISSING}
+    given = {name: value for name, value in values.items() if name in needed}
     assert command_line("x", cls(**given)).startswith("geodiff eval x")
     assert len(shlex.split(command_line("x", cls(**given)))) == 3 + sum(
         len(v) if isinstance(v, tuple) else 1 for v in given.values()
@@ -191,26 +196,30 @@ def test_the_command_line_names_all_that_changes_a_number(cls):
 
 def test_what_changes_no_number_is_about_output_and_machines():
     assert {
-        *("out", "results", "quiet", "skip_broken", "stop_on_broken", "save_depth"),
+        *("out", "results", "quiet", "stop_on_broken", "save_depth"),
         *("engine", "workers", "gpus"),
     } == CHANGE_NO_NUMBER
 
 
 def test_options_are_shown_in_their_groups():
     groups = {
-        OUTPUT: {"out", "results", "quiet", "stop_on_broken", "skip_broken", "save_depth"},
+        OUTPUT: {"out", "results", "quiet", "stop_on_broken", "save_depth"},
         PRIOR: {"seed", "steps", "ensemble", "resolution", "dtype", "prior"},
-        OTHERS: {"max", "updates", "clouds", "exact_", "name"},
+        DEFAULT_SECTION: {"max", "updates", "clouds", "exact_", "name"},
     }
     samples = {"data", "methods", "datasets", "scenes", "limit", "views", "perturb", "sample", "pairs"}
     groups[SAMPLES] = samples | {"pixel_centre", "frames", "count", "neighbours", "rows", "exact"}
     for cls in (PairsOptions, PaperOptions, DirOptions, FigureOptions, CaptureEvalOptions):
-        for each in fields(cls):
-            rules = rules_of(each)
+        for name, option in settings_of(cls).items():
             for group, names in groups.items():
-                if rules is not None and each.name in names and not rules.is_argument:
-                    assert rules.panel == group, f"{cls.__name__}.{each.name}"
-    assert rules_of(PairsOptions.__dataclass_fields__["perturb"]).metavar == "DEGREES,SHARE"
-    poses = PosesOptions.__dataclass_fields__
-    metavars = {name: rules_of(poses[name]).metavar for name in ("perturb", "drift", "data", "exact")}
-    assert metavars == {"perturb": "DEGREES,SHARE", "drift": "DEGREES,PIXELS", "data": "DIR", "exact": "DIR"}
+                if name in names and not option.is_argument:
+                    assert option.section == group, f"{cls.__name__}.{name}"
+    assert settings_of(PairsOptions)["perturb"].metavar == "DEGREES,FRACTION"
+    poses = settings_of(PosesOptions)
+    metavars = {name: poses[name].metavar for name in ("perturb", "drift", "data", "exact")}
+    assert metavars == {
+        "perturb": "DEGREES,FRACTION",
+        "drift": "DEGREES,PIXELS",
+        "data": "DIR",
+        "exact": "DIR",
+    }

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from geodiff_plugin.algorithm.gradients import RULES
+from geodiff_plugin.algorithm.optimizers import OPTIMIZERS
 from geodiff_plugin.config import DEFAULT, PAPER, value_of
 from geodiff_plugin.evaluation import experiment, pairs
 from geodiff_plugin.evaluation.baselines import find_method
@@ -22,7 +22,7 @@ def record(method, sample, abs_rel=0.5, delta1=0.5, seconds=2.0, **rest):
     return head | {"capped": scores, "all_pixels": scores, "seconds": seconds} | rest
 
 
-def test_remarks_say_prior_what_did_not_apply_and_what_was_broken(tmp_path):
+def test_remarks_state_the_prior_what_did_not_apply_and_what_was_broken(tmp_path):
     options = PairsOptions(out=tmp_path, prior="x/y", seed=3, ensemble=4)
     no = {"status": "not applicable", "reason": "not rectified"}
     records = [record("guided", "a"), record("sgbm", "a", **no), record("sgbm", "b", **no)]
@@ -52,13 +52,13 @@ def test_every_change_is_one_of_its_preset_and_the_first_is_none():
         for method in methods:
             base, _, text = method.partition(":")
             find_method(method)  # names a method that there is
-            for knob, _, value in (part.partition("=") for part in filter(None, text.split("+"))):
+            for parameter, _, value in (part.partition("=") for part in filter(None, text.split("+"))):
                 assert base == methods[0]
-                assert str(value_of(knob, config)) != value, f"{method} changes nothing"
-    rules = {row.removeprefix("rule ") for row, _ in CHANGES["guided"] if row.startswith("rule ")}
-    assert rules == set(RULES) - {"adam"}
-    rules = {row.removeprefix("rule ") for row, _ in CHANGES["paper"] if row.startswith("rule ")}
-    assert rules == set(RULES) - {"summed"}
+                assert str(value_of(parameter, config)) != value, f"{method} changes nothing"
+    names = {row.removeprefix("optimizer ") for row, _ in CHANGES["guided"] if row.startswith("optimizer ")}
+    assert names == set(OPTIMIZERS) - {"adam"}
+    rules = {row.removeprefix("optimizer ") for row, _ in CHANGES["paper"] if row.startswith("optimizer ")}
+    assert rules == set(OPTIMIZERS) - {"summed"}
     without = {row: method for row, method in CHANGES["guided"] if row.startswith("without ")}
     assert without == {
         f"without {name}": f"guided:weights.{name}=0" for name in DEFAULT.weights if name != "points"
@@ -66,19 +66,19 @@ def test_every_change_is_one_of_its_preset_and_the_first_is_none():
 
 
 def test_changes_are_means_worst_and_paired_differences_to_the_unchanged_preset():
-    rng, methods = np.random.default_rng(0), ("paper", "paper:weights.prior_pull=0", "paper:rule=adam")
+    rng, methods = np.random.default_rng(0), ("paper", "paper:weights.affine_reg=0", "paper:optimizer=adam")
     records = [
         record(method, str(i), *rng.uniform(0.1, 0.9, 3))
         for method in methods
         for i in range(7 - (method != "paper"))
     ]
     table = pairs.changes_table([*records, record("sgbm", "0")], "paper")
-    assert table.title == "Algorithm 1 as printed, one thing changed, 7 pairs"
+    assert table.title == "Algorithm 1 as printed, one change at a time, 7 pairs"
     assert table.header == (
         *("change", "pairs", "AbsRel ↓ [95 %]", "worst"),
-        *("δ1 ↑ [95 %]", "AbsRel more", "seconds"),
+        *("δ1 ↑ [95 %]", "AbsRel change", "seconds"),
     )
-    assert [row[:2] for row in table.rows] == [("as it is", "7"), ("γ = 0", "6"), ("rule adam", "6")]
+    assert [row[:2] for row in table.rows] == [("unchanged", "7"), ("γ = 0", "6"), ("optimizer adam", "6")]
     base = {r["sample"]: r["capped"]["raw"]["abs_rel"] for r in records[:7]}
     for row, group in zip(table.rows, (records[:7], records[7:13], records[13:]), strict=True):
         errors = [r["capped"]["raw"]["abs_rel"] for r in group]
@@ -86,7 +86,7 @@ def test_changes_are_means_worst_and_paired_differences_to_the_unchanged_preset(
         assert row[4].split()[0] == f"{np.mean([r['capped']['raw']['delta1'] for r in group]):.3f}"
         assert row[6] == f"{np.mean([r['seconds'] for r in group]):.1f}"
         more = np.mean([r["capped"]["raw"]["abs_rel"] - base[r["sample"]] for r in group])
-        assert row[5].split()[0] == ("-" if row[0] == "as it is" else f"{more:+.3f}")
+        assert row[5].split()[0] == ("-" if row[0] == "unchanged" else f"{more:+.3f}")
 
 
 def test_flatness_halves_and_doubles_every_number_and_names_the_pair_that_moves_most():
@@ -105,7 +105,7 @@ def test_flatness_halves_and_doubles_every_number_and_names_the_pair_that_moves_
     errors = {(r["method"], r["sample"]): r["capped"]["raw"]["abs_rel"] for r in records}
     table = pairs.flatness_table(records)
     assert table.title.endswith("twice its value, 3 pairs") and len(table.rows) == len(NUMBERS)
-    assert f"{np.mean([errors['guided', s] for s in 'abc']):.4f} as they are" in table.note
+    assert f"{np.mean([errors['guided', s] for s in 'abc']):.4f} with default values" in table.note
     for row, number, at in zip(table.rows, NUMBERS, range(2), strict=False):
         changed = FLATNESS[1 + 2 * at : 3 + 2 * at]
         means = [f"{np.mean([errors[m, s] for s in 'abc']):.4f}" for m in changed]
@@ -113,7 +113,7 @@ def test_flatness_halves_and_doubles_every_number_and_names_the_pair_that_moves_
         most, label = max(moved)
         assert row == (f"`{number}`", f"{value_of(number, DEFAULT):g}", *means, f"{most:.3f} ({label})")
     assert table.rows[-1][2:] == ("-", "-", "0.000")
-    assert table.header == ("number", "value", "at half", "at twice", "largest change of a pair")
+    assert table.header == ("parameter", "value", "at half", "at twice", "largest change of a pair")
 
 
 def test_cost_is_the_median_time_and_the_greatest_peak_of_finished_pairs():
@@ -185,19 +185,21 @@ def compared(monkeypatch):
     return handed
 
 
-def test_pairs_say_what_was_drawn_and_take_the_methods_of_the_options(compared, tmp_path):
+def test_pairs_state_what_was_drawn_and_use_the_methods_of_the_options(compared, tmp_path):
     drawn, whole = (
         DirOptions(data=tmp_path, out=tmp_path, methods=("sgbm",), seed=8, sample=n) for n in (2, None)
     )
     pairs.run_pairs("pairs", drawn), pairs.run_pairs("pairs", whole)
     (name, options, made), (_, _, other) = compared
     assert (name, options, made.refs, made.methods) == ("pairs", drawn, REFS, ("sgbm",))
-    assert (made.title, made.tables) == ("Results pair by pair", pairs.tables.pairs_tables)
+    assert (made.title, made.tables) == ("Results per pair", pairs.tables.pairs_tables)
     assert list(made.remarks) == ["Drawn with seed 8: d/a, d/b."] and list(other.remarks) == []
 
 
-@pytest.mark.parametrize(("name", "title"), [("parts", "Parts of the default"), ("flatness", "Flatness")])
-def test_changes_run_their_methods_first_and_show_added_ones_apart(compared, tmp_path, name, title):
+@pytest.mark.parametrize(
+    ("name", "title"), [("parts", "Ablation"), ("flatness", "Hyperparameter sensitivity")]
+)
+def test_changes_run_their_methods_first_and_show_added_ones_separately(compared, tmp_path, name, title):
     options = PairsOptions(out=tmp_path, methods=("sgbm", "fast"))
     pairs.run_changes(name, options)
     ((given, _, made),) = compared
@@ -264,7 +266,7 @@ def test_cost_runs_every_method_alone_with_the_steps_of_its_prior(monkeypatch, t
     ((name, given, title, (table,), remarks),) = written
     assert (name, given, title) == ("cost", options, "Cost") and len(table.rows) == len(names)
     assert remarks[0].startswith("Prior bundled") and remarks[-1] == (
-        "Denoising steps of each: 4 with bundled, its own number with x/y."
+        "Denoising steps per method: 4 with bundled, default number with x/y."
     )
     pairs.run_cost("cost", PairsOptions(out=tmp_path, steps=7))
     assert {n for _, _, n, _ in asked[len(names) :]} == {7}

@@ -258,7 +258,7 @@ def compared(monkeypatch):
     return handed
 
 
-def test_a_table_measures_the_pairs_of_its_columns_and_says_what_is_missing(there, compared, tmp_path):
+def test_a_table_measures_the_pairs_of_its_columns_and_lists_what_is_missing(there, compared, tmp_path):
     options = PairsOptions(data=tmp_path, out=tmp_path, methods=("fast",))
     paper.run_paper_table("table1", options)
     ((name, given, made),) = compared
@@ -328,7 +328,7 @@ def test_the_ablation_shows_both_presets_changed(there, compared):
         ("ablation", "none", "--data must be a folder with the data of ablation; got none"),
     ],
 )
-def test_a_table_without_data_says_how_to_obtain_it(there, compared, name, data, words):
+def test_a_table_without_data_states_how_to_obtain_it(there, compared, name, data, words):
     there.pop("booster", None)
     if name == "ablation":
         there.clear()

@@ -16,7 +16,7 @@ REFS = [SampleRef("d", name, {}) for name in "abcd"]
 KINDS = {"a": (True, 0), "b": (False, 2), "c": (True, 1), "d": (False, 0)}
 
 
-def record(sample, error, warnings=(), rectified=True, **notes):
+def record(sample, error, severities=(), rectified=True, **notes):
     scores = {"raw": None if error is None else {"abs_rel": error}, "aligned": {"abs_rel": 0.01}}
     status = "not applicable" if error is None else "ok"
     head = {
@@ -26,19 +26,22 @@ def record(sample, error, warnings=(), rectified=True, **notes):
         "rectified": rectified,
         "key": f"{sample}{error}",
     }
-    return head | {"all_pixels": scores, "notes": {"method": {"warnings": list(warnings), **notes}}}
+    findings = [{"code": "a", "severity": severity, "text": "Said."} for severity in severities]
+    return head | {"all_pixels": scores, "notes": {"method": {"findings": findings, **notes}}}
 
 
-def test_errors_of_changed_pairs_are_shown_under_the_names_of_the_first_column():
+@pytest.mark.parametrize("severity", ["reason", "remark", "warning"])
+def test_errors_of_changed_pairs_are_shown_under_the_names_of_the_first_column(severity):
+    """An assumption alone does not indicate an error."""
     columns = {
         "true": [record("a", 0.1), record("b", 0.2), record("c", 0.3, rectified=False)],
         "wrong": [
             record("a-turn", 0.26),
-            record("b-turn", 0.5, ["said"]),
+            record("b-turn", 0.5, ["assumption", severity]),
             record("c-turn", None, rectified=False),
         ],
         "lost": [record(name, None) for name in ("a-x", "b-x")] + [record("c-x", None, rectified=False)],
-        "edge": [record("a", 0.25), record("b", 0.9), record("c", 0.8, rectified=False)],
+        "edge": [record("a", 0.25), record("b", 0.9, ["assumption"]), record("c", 0.8, rectified=False)],
     }
     table = poses.poses_table("Title", columns, "Note")
     assert (table.title, table.note, table.header) == (
@@ -110,7 +113,7 @@ def test_every_table_has_its_pairs_poses_and_number_of_views(known, tmp_path):
     assert names == {
         "AbsRel of 4 real pairs, two views": [(*way, s, 2) for way in ways for s in "abcd"],
         "AbsRel of 2 real pairs, three views": [(*way, s, 3) for way in ways for s in "bc"],
-        "AbsRel of 2 rectified pairs, the rig drifted": [
+        "AbsRel of 2 rectified pairs, drifted rig": [
             *(("true, given", "given", s, 2) for s in "ac"),
             *(("drifted, given", "given", s + drifted, 2) for s in "ac"),
             *(("drifted, refined", "refine", s + drifted, 2) for s in "ac"),
@@ -139,10 +142,10 @@ def test_every_table_has_its_pairs_poses_and_number_of_views(known, tmp_path):
     for table, words in zip(
         (shown[0], shown[2], shown[3], shown[4]),
         (
-            "withheld but for",
+            "the length of the first baseline, and no poses",
             "",
-            "turned by 0.5 degrees and its image has moved by 3 px",
-            "by up to 2 degrees and shifted by up to 25 %",
+            "rotated by 0.5 degrees and its image is shifted by 3 px",
+            "by up to 2 degrees and translated by up to 25 %",
         ),
         strict=True,
     ):
@@ -153,8 +156,8 @@ def test_every_table_has_its_pairs_poses_and_number_of_views(known, tmp_path):
 
 
 def test_no_drift_drifts_no_pair_and_the_limit_is_of_real_pairs(known, tmp_path):
-    told = {"out": tmp_path, "drift": "0,0", "limit": 3}
-    poses.run_poses("poses", PosesOptions(data=tmp_path / "real", exact=tmp_path / "exact", **told))
+    reported = {"out": tmp_path, "drift": "0,0", "limit": 3}
+    poses.run_poses("poses", PosesOptions(data=tmp_path / "real", exact=tmp_path / "exact", **reported))
     poses.run_poses("poses", PosesOptions(data=tmp_path / "real", out=tmp_path, drift="0,2"))
     poses.run_poses("poses", PosesOptions(exact=tmp_path / "exact", out=tmp_path))
     tables = [[c.head["table"] for c in made.cells] for _, _, made in known]

@@ -85,7 +85,7 @@ def test_cells_of_numbers_nothing_and_nan():
     assert tables.value_at(record, "a.b.c") == 0.5 and tables.value_at(record, "a.none.c") is None
     group = [record, {}, {"a": {"b": {"c": 1.5}}}]
     assert tables.mean_of("a.b.c")(group) == "1.000" and tables.mean_of("a.b.c", 1, 100.0)(group) == "100.0"
-    assert tables.most_of("x", 1)([{"x": 1.0}, {"x": 3.0}, {"x": 2.0}]) == "3.0"
+    assert tables.max_of("x", 1)([{"x": 1.0}, {"x": 3.0}, {"x": 2.0}]) == "3.0"
     assert (tables.count_of_pairs(1), tables.count_of_pairs(2, "posed ")) == ("1 pair", "2 posed pairs")
     twice = [{"dataset": "d", "sample": s} for s in "aab"]
     assert tables.pairs_of(twice) == "2 pairs" and tables.label_of(twice[2]) == "d/b"
@@ -213,7 +213,8 @@ def test_pairs_have_a_row_each_and_means_of_all_and_of_each_kind():
     assert versus.title.startswith("guided against")
     titles = [table.title for table in rest]
     assert titles[:3] == [f"All metrics, {g}" for g in ("3 pairs", "2 rectified pairs", "1 posed pair")]
-    assert titles[3:] == [*DETAILS, "Confidence by decile"]
+    benchmarks = [f"Metrics of the data sets' benchmarks, {kind} pairs" for kind in ("rectified", "posed")]
+    assert titles[3:] == [*benchmarks, *DETAILS, "Confidence by decile", "Risk and coverage"]
     assert [row[1] for row in rest[1].rows] == ["2", "2", "2"]
     assert not any("against" in t.title for t in tables.pairs_tables(records[3:]))
     assert tables.pairs_tables(records, "prior-aligned")[2].title.startswith("prior + oracle against")
@@ -221,7 +222,7 @@ def test_pairs_have_a_row_each_and_means_of_all_and_of_each_kind():
     assert (only.note, len(only.rows), only.rows[-1][0]) == ("N", 2, "mean of 1 pair")
 
 
-def test_a_method_without_metres_needs_an_oracle_and_its_heading_says_so(monkeypatch):
+def test_a_method_without_metres_needs_an_oracle_and_its_heading_states_this(monkeypatch):
     relative, metric = (make_records("sgbm", i, 2, metric=bool(i)) for i in (0, 1))
     assert [heading for heading, _ in tables.method_columns(relative)] == ["SGBM + fill + oracle"]
     assert tables.method_columns(metric) == [("SGBM + fill", metric)]
@@ -249,7 +250,7 @@ def test_details_are_means_of_the_entries_that_they_name(title):
             for region in ("visible", "edge", "flat")
             for name in ("epe", "bad1", "bad2", "d1")
         ],
-        "Boundaries, dense truth": [("boundaries", name) for name in ("f1", "dbe_acc", "dbe_comp")],
+        "Boundaries, dense ground truth": [("boundaries", name) for name in ("f1", "dbe_acc", "dbe_comp")],
         "AUSE": [("ause",), ("ause_confidence", "ause"), ("ause_confidence", "random")],
     }[title]
 
@@ -277,25 +278,103 @@ def test_a_detail_that_no_record_has_shows_no_row():
     assert table.rows == () and table.header == ("method", "EPE px", "bad-1", "bad-2", "bad-3", "D1")
 
 
-def test_confidence_by_decile_weighs_pairs_alike_and_pixels_by_their_share():
+def test_the_risk_of_the_most_confident_pixels_is_the_mean_over_pairs_at_each_coverage():
+    rng, records = np.random.default_rng(6), make_records("guided", 1, 3)
+    for record in records[:2]:
+        record["risk_coverage"] = {name: rng.uniform(0, 0.5, 20).tolist() for name in ("risk", "oracle")}
+    table = tables.risk_table(records)
+    assert [row[:2] for row in table.rows] == [("guided", "confidence"), ("guided", "error (best possible)")]
+    curves = [record["risk_coverage"] for record in records[:2]]
+    areas = [np.mean([np.subtract(c["risk"], c["oracle"]).mean() for c in curves]), 0.0]
+    for row, name, area in zip(table.rows, ("risk", "oracle"), areas, strict=True):
+        # Of 20 points, from all pixels down to a twentieth of them.
+        expected = [np.mean([c[name][k] for c in curves]) for k in (0, 2, 5, 10, 15)]
+        np.testing.assert_allclose(list(map(float, row[2:])), [*expected, area], atol=5.1e-4)
+    assert table.header[2:] == ("best 100 %", "best 90 %", "best 75 %", "best 50 %", "best 25 %", "AUSE")
+    assert tables.risk_table(records[2:]).rows == ()
+
+
+def test_confidence_by_decile_weighs_pairs_equally_and_pixels_by_their_fraction():
     rng, records = np.random.default_rng(5), make_records("guided", 1, 3)
     for record in records[:2]:
-        shares = rng.dirichlet(np.ones(10))
-        shares[[2, 9]] = 0.0
+        fractions = rng.dirichlet(np.ones(10))
+        fractions[[2, 9]] = 0.0
         record["confidence"] = [
-            {"share": float(share)}
-            | {n: float(rng.uniform()) if share else None for n in ("promised", "kept", "abs_rel")}
-            for share in shares
+            {"fraction": float(fraction)}
+            | {n: float(rng.uniform()) if fraction else None for n in ("predicted", "observed", "abs_rel")}
+            for fraction in fractions
         ]
-    records[1]["confidence"][4] = {"share": 0.0, "promised": None, "kept": None, "abs_rel": None}
+    records[1]["confidence"][4] = {"fraction": 0.0, "predicted": None, "observed": None, "abs_rel": None}
     table = tables.confidence_table(records)
-    assert table.header == ("method", "confidence", "share of pixels", "promised", "kept", "AbsRel")
+    assert table.header == ("method", "confidence", "fraction of pixels", "predicted", "observed", "AbsRel")
     assert len(table.rows) == 8 and table.title == "Confidence by decile"
     for row, k in zip(table.rows, (0, 1, 3, 4, 5, 6, 7, 8), strict=True):
         parts = [record["confidence"][k] for record in records[:2]]
-        total = sum(part["share"] for part in parts)
+        total = sum(part["fraction"] for part in parts)
         assert row[:2] == ("guided", f"{k / 10:.1f} to {k / 10 + 0.1:.1f}")
         assert row[2] == f"{total / 2:.3f}"
-        for at, name in enumerate(("promised", "kept", "abs_rel"), 3):
-            mean = sum(part["share"] * (part[name] or 0) for part in parts) / total
+        for at, name in enumerate(("predicted", "observed", "abs_rel"), 3):
+            mean = sum(part["fraction"] * (part[name] or 0) for part in parts) / total
             assert float(row[at]) == pytest.approx(mean, abs=5.1e-4)
+
+
+def test_benchmarks_have_a_row_per_set_and_method_for_rectified_and_for_posed_pairs():
+    records = [*make_records("guided", 1), *make_records("sgbm", 2, rectified=True)]
+    for i, record in enumerate(records):
+        scores = {"bad_px": 2.0, "all": None if i % 3 else 0.01 * i, "noc": 0.02 * i}
+        record["benchmark"] = scores if record["rectified"] else None
+        record["all_pixels"]["raw"]["inliers"] = 0.05 * i
+    relative = make_records("prior-aligned", 3, metric=False, benchmark=None)
+    rectified, posed = tables.benchmark_tables([*records, *relative])
+    mine = [r for r in records if r["rectified"] and (r["dataset"], r["method"]) == ("set0", "guided")]
+    row = next(row for row in rectified.rows if row[:2] == ("set0", "guided"))
+    known = [r["benchmark"]["all"] for r in mine if r["benchmark"]["all"] is not None]
+    assert row[2:] == (
+        *(str(len(mine)), f"{np.mean([r['all_pixels']['raw']['abs_rel'] for r in mine]):.3f}", "> 2 px"),
+        f"{100 * np.mean(known):.2f} ({len(known)} of {len(mine)})",
+        f"{100 * np.mean([r['benchmark']['noc'] for r in mine]):.2f}",
+    )
+    assert {row[:2] for row in rectified.rows} == {
+        ("set0", "guided"),
+        *((f"set{i}", "SGBM + fill") for i in range(2)),
+    }
+    (row,) = posed.rows
+    theirs = [r for r in records if not r["rectified"]]
+    assert row[:3] == ("set1", "guided", "3")
+    assert row[4] == f"{100 * np.mean([r['all_pixels']['raw']['inliers'] for r in theirs]):.1f}"
+
+
+def scored(dataset, sample, method, error, rectified=True):
+    scores = {"raw": {"abs_rel": error}, "aligned": {"abs_rel": 9.0}}
+    head = {"dataset": dataset, "sample": sample, "method": method, "status": "ok"}
+    return head | {"rectified": rectified, "all_pixels": scores}
+
+
+def test_each_split_has_a_table_with_mean_and_median_of_each_kind_of_pairs():
+    errors = {"000000": 0.1, "000013": 0.2, "000061": 0.6}
+    records = [scored("kitti2012", name, "guided", error) for name, error in errors.items()]
+    records += [scored("mvsnet", "7scenes_f050", "guided", 0.5, rectified=False)]
+    records += [scored("kitti2012", name, "sgbm", 2 * error) for name, error in errors.items()]
+    records += [scored("middlebury2003", name, "guided", e) for name, e in (("cones", 0.3), ("teddy", 0.5))]
+    records += [scored("folder", "mine", "guided", 7.0)]
+    tuned, unseen = tables.split_tables(records)
+    assert tuned.title == "4 pairs that constants were tuned on"
+    assert tuned.groups == (("", 1), ("4 pairs", 2), ("3 rectified pairs", 2), ("1 posed pair", 2))
+    assert tuned.rows == (
+        ("guided", "0.350", "0.350", "0.300", "0.200", "0.500", "0.500"),
+        ("SGBM + fill", "0.600 (3 of 4)", "0.400", "0.600", "0.400", "-", "-"),
+    )
+    assert unseen.title == "2 pairs that nothing was tuned on"
+    assert unseen.rows == (("guided", "0.400", "0.400"),)
+    assert tables.split_tables([scored("folder", "mine", "guided", 7.0)]) == []
+    assert [t.title for t in tables.pairs_tables([r | other_scores() for r in records])[:2]] == [
+        tuned.title,
+        unseen.title,
+    ]
+
+
+def other_scores():
+    """What the other tables read of a record."""
+    names = ("disparity", "ause", "boundaries", "confidence", "ause_confidence", "benchmark")
+    empty = {"raw": None, "aligned": None}
+    return dict.fromkeys(names) | {"regions": {}, "seconds": 1.0, "capped": empty}

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import FrozenInstanceError, fields
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,15 +10,18 @@ import torch
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.evidence.inputs import (
     Arguments,
     Inputs,
+    _entry,
+    _is_nested_matrix,
     as_points,
     left_images,
     read_inputs,
     split_views,
 )
+from tests.unit.error_sentences import check_error
 
 SIZE = (36, 48)
 RNG = np.random.default_rng(0)
@@ -55,15 +59,16 @@ def same_image(image_01: torch.Tensor, image: np.ndarray) -> bool:
 
 def check(found: Inputs, K_left, views, poses, shared: bool) -> None:
     """``views`` are numbers of images with their K; poses are those of right cameras in the left frame."""
-    np.testing.assert_array_equal(found.K_left, K_left)
+    np.testing.assert_array_equal(found.left.K, K_left)
     assert len(found.views) == len(found.rigs) == len(views) and found.shared_intrinsics is shared
     for view, rig, (image, K), E in zip(found.views, found.rigs, views, poses, strict=True):
         assert same_image(view.image_01, IMAGES[image])
         np.testing.assert_array_equal(rig.K_left, K_left)
         np.testing.assert_array_equal(rig.K_right, K)
         np.testing.assert_allclose(rig.E, E, atol=1e-12)
-        assert view.K.dtype == view.T_right_from_left.dtype == torch.float32
-        np.testing.assert_allclose(view.K, K, rtol=1e-6)
+        assert view.camera.K.dtype == view.T_right_from_left.dtype == np.float32
+        assert view.camera.size == IMAGES[image].shape[1::-1]
+        np.testing.assert_allclose(view.camera.K, K, rtol=1e-6)
         np.testing.assert_allclose(view.T_right_from_left, np.linalg.inv(E), atol=1e-6)
 
 
@@ -164,12 +169,12 @@ ERRORS = [
     ),
     (
         {"right": (IMAGES[0], IMAGES[0]), "E": (ES[1], ES[2], ES[1])},
-        r"E\[right view 2\] must be a pose whose camera centre differs",
+        r"E\[right view 2\] must be a pose with a baseline",
     ),
-    ({"E": np.eye(4)}, "E must be a pose whose camera centre differs"),
+    ({"E": np.eye(4)}, "E must be a pose with a baseline"),
     (
         {"right": [IMAGES[0]] * 2, "E": [ES[1], np.eye(4)]},
-        r"E\[1\] must be a pose whose camera centre differs",
+        r"E\[1\] must be a pose with a baseline",
     ),
     ({"right": IMAGES[0].astype(float)}, r"right must be floats in \[0, 1\]"),
     ({"right": (IMAGES[0], IMAGES[0].astype(float)), "E": tuple(ES[:3])}, r"right, view 2, must be floats"),
@@ -190,12 +195,12 @@ def test_the_argument_that_is_wrong_is_named_with_its_place(changes, message):
 @pytest.mark.parametrize(
     ("right", "K", "E", "name"),
     [
-        (0, "off", 1, "K puts"),
-        (0, ("good", "off"), 1, r"K\[right\] puts"),
-        (0, ("off", "off"), 1, "K puts"),
-        ((0, 0), ("good", "good", "off"), (0, 1, 2), r"K\[right view 2\] puts"),
-        ([0, 0], ["good", "off"], [1, 2], r"K\[1\] puts"),
-        ([0, 0], ["good", ("good", "off")], [1, 2], r"K\[1\]\[right\] puts"),
+        (0, "off", 1, "K has its principal point"),
+        (0, ("good", "off"), 1, r"K\[right\] has its principal point"),
+        (0, ("off", "off"), 1, "K has its principal point"),
+        ((0, 0), ("good", "good", "off"), (0, 1, 2), r"K\[right view 2\] has its principal point"),
+        ([0, 0], ["good", "off"], [1, 2], r"K\[1\] has its principal point"),
+        ([0, 0], ["good", ("good", "off")], [1, 2], r"K\[1\]\[right\] has its principal point"),
     ],
 )
 def test_the_K_that_does_not_fit_its_right_image_is_named_unless_that_is_a_crop(right, K, E, name):
@@ -233,7 +238,7 @@ def test_warnings_about_lenses_points_and_baselines_name_their_argument():
     right = 36.06 * 51 / 50, 100.0  # in 35 mm equivalent of the focal length of K, and another one
     assert codes_of(lambda: read(with_exif(right[0]), (KS[2], KS[0]), ES[1])) == []
     (found,) = codes_of(lambda: read((IMAGES[0], with_exif(right[1])), KS[0], tuple(ES[:3])))
-    assert found.startswith("camera.other-lens: K has a focal length of 50 px for right, view 2")
+    assert found.startswith("camera.focal-mismatch: K has a focal length of 50 px for right, view 2")
     far = [POINTS[0] * 1000, POINTS[1]]
     (found,) = codes_of(lambda: read(None, KS[0], None, far))
     assert found.startswith("points.far: points[0] has depths of")
@@ -241,7 +246,7 @@ def test_warnings_about_lenses_points_and_baselines_name_their_argument():
     E = ES[1].copy()
     E[:3, 3] *= 1000
     (found,) = codes_of(lambda: read([IMAGES[0]] * 2, KS[0], [ES[1], E]))
-    assert found.startswith("baseline.long: E[1] has a baseline of")
+    assert found.startswith("baseline.long: E[1] has an implausible baseline of")
     assert codes_of(lambda: read([IMAGES[0]] * 2, KS[0], [ES[1], E], unit=None)) == []
     assert codes_of(lambda: read(IMAGES[0], KS[0], ES[1], POINTS[0])) == []
 
@@ -251,19 +256,21 @@ def test_views_and_points_go_to_the_device_of_the_left_image(device):
     (found,) = read((IMAGES[1], IMAGES[2]), tuple(KS[:3]), tuple(ES[:3]), POINTS[0].astype(np.float32))
     left = torch.zeros(3, *SIZE, device=device, dtype=torch.float64)
     posed, as_read = found.posed_views(left), found.with_left(left)
-    assert posed.left_01 is as_read.left_01 is left and as_read.views is found.views
-    for one, other in zip(posed.views, found.views, strict=True):
+    assert posed.left.image_01 is as_read.left.image_01 is left and as_read.rights is found.views
+    for one, other in zip(posed.rights, found.views, strict=True):
         assert one.image_01.device.type == device and one.image_01.dtype == torch.float32
         assert one.image_01.shape == other.image_01.shape
-        assert one.K is other.K and one.T_right_from_left is other.T_right_from_left
+        assert one.camera is other.camera and one.T_right_from_left is other.T_right_from_left
     for each in (posed, as_read):
-        assert each.K_left.dtype == torch.float32 and each.K_left.device.type == "cpu"
-        np.testing.assert_allclose(each.K_left, KS[0], rtol=1e-6)
+        assert each.left.camera.K.dtype == np.float32 and each.left.camera.size == SIZE[::-1]
+        np.testing.assert_allclose(each.left.camera.K, KS[0], rtol=1e-6)
+        np.testing.assert_array_equal(each.left.T_right_from_left, np.eye(4))
     points = found.points_on(torch.device(device))
     assert points.device.type == device and points.dtype == torch.float32 and points.shape == (5, 3)
     (bare,) = read(IMAGES[0], KS[0], ES[1])
     assert bare.points_on(torch.device(device)) is None
-    assert {field.name for field in fields(Arguments)} == {"right", "K", "E", "points", "points_confidence"}
+    given = {"right", "K", "E", "points", "points_confidence", "mask", "right_mask"}
+    assert {field.name for field in fields(Arguments)} == given
 
 
 CLOUD = np.array(
@@ -315,10 +322,10 @@ def test_a_sparse_map_is_zero_where_nothing_is_known(kind):
         (np.ones((4, 3), int), None, "points must be metres as floats"),
         (np.ones((4, 8), np.uint16), None, "points must be metres as floats"),
         ([[2] * 8] * 3, None, "points must be metres as floats"),
-        (np.zeros((4, 8)), None, "points must be .*, at least one of them known; got none"),
-        (np.full((4, 3), np.nan), None, "points must be .*, at least one of them known; got none"),
-        (np.ones((4, 3)), np.ones((4, 3)), r"points_confidence must be of shape \(4,\), as the points"),
-        (np.ones((4, 8)), np.ones(4), r"points_confidence must be of shape \(4, 8\), as the points"),
+        (np.zeros((4, 8)), None, "points must be .*, at least one of them known; got only"),
+        (np.full((4, 3), np.nan), None, "points must be .*, at least one of them known; got only"),
+        (np.ones((4, 3)), np.ones((4, 3)), r"points_confidence must be of shape \(4,\), like the points"),
+        (np.ones((4, 8)), np.ones(4), r"points_confidence must be of shape \(4, 8\), like the points"),
         (
             np.ones((4, 3)),
             [0.1, 1.01, 0, 0],
@@ -353,9 +360,9 @@ def test_views_are_split_into_the_constructors_arguments():
     ("views", "message"),
     [
         ("views", "views must be a list"),
-        ([], "views must be .*, two at least; got 0"),
-        ([(IMAGES[0], KS[0], ES[0])], "views must be .*, two at least; got 1"),
-        ([(IMAGES[0], KS[0], ES[0]), (IMAGES[1], KS[1])], r"2 entries of lengths \[3, 2\]. Give three"),
+        ([], "views must be .*, at least two; got 0"),
+        ([(IMAGES[0], KS[0], ES[0])], "views must be .*, at least two; got 1"),
+        ([(IMAGES[0], KS[0], ES[0]), (IMAGES[1], KS[1])], r"2 entries of lengths \[3, 2\]. Pass three"),
         ([(IMAGES[0], KS[0], ES[0]), 5], r"2 entries of lengths \[3, 'int'\]"),
         ([(IMAGES[0], np.zeros((3, 3)), ES[0]), (IMAGES[1], KS[1], ES[1])], r"K\[left\]"),
         ([("image.png", KS[0], ES[0]), (IMAGES[1], KS[1], ES[1])], "the left view's image"),
@@ -370,7 +377,7 @@ def test_the_left_views_K_has_to_fit_its_image_unless_it_is_a_crop():
     off = KS[0].copy()
     off[1, 2] = 37.0  # of 36 rows, and within 48
     views = [(IMAGES[0], off, ES[0]), (IMAGES[1], KS[1], ES[1])]
-    with pytest.raises(InputError, match=r"K\[left\] puts .* outside the left view's image of 48x36"):
+    with pytest.raises(InputError, match=r"K\[left\] has .* outside the left view's image of 48x36"):
         split_views(views)
     assert split_views(views, cropped=True).left_size == (48, 36)
     (found,) = codes_of(lambda: split_views([(with_exif(100.0), KS[0], ES[0]), views[1]]))
@@ -409,12 +416,18 @@ def test_left_images_in_every_form_of_a_batch():
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        ([], "image must be an image or a list of images; got an empty one"),
-        (np.zeros((0, *SIZE, 3), np.uint8), "image must be an image or a list of images; got an empty one"),
-        ([IMAGES[0], IMAGES[1]], r"image\[1\] must be of 48x36 pixels, as image\[0\]; got 60x40. Call once"),
+        ([], "image must be an image or a list of images; got an empty list or batch"),
+        (
+            np.zeros((0, *SIZE, 3), np.uint8),
+            "image must be an image or a list of images; got an empty list or batch",
+        ),
+        (
+            [IMAGES[0], IMAGES[1]],
+            r"image\[1\] must be of 48x36 pixels, like image\[0\]; got 60x40. Use one call",
+        ),
         (
             [[IMAGES[0]], [IMAGES[0], IMAGES[2]]],
-            r"image\[1\]\[1\] must be of 48x36 pixels, as image\[0\]\[0\]; got 36x48",
+            r"image\[1\]\[1\] must be of 48x36 pixels, like image\[0\]\[0\]; got 36x48",
         ),
         ([IMAGES[0], IMAGES[0].astype(float)], r"image\[1\] must be floats"),
         (IMAGES[0].astype(float), r"image must be floats"),
@@ -423,3 +436,75 @@ def test_left_images_in_every_form_of_a_batch():
 def test_left_images_that_are_none_are_named_by_their_index(image, message):
     with pytest.raises(InputError, match=message):
         left_images(image)
+
+
+@pytest.mark.parametrize("name", ["K", "E", "points", "confidence"])
+@pytest.mark.parametrize("length", [1, 2, 4])
+def test_a_list_of_another_length_than_there_are_left_images_is_rejected_by_its_name(name, length):
+    """As many as the list of right images, or else of points, has entries."""
+    whole = {"right": [IMAGES[0]] * 3, "K": [KS[0]] * 3, "E": ES[1:4], "points": POINTS}
+    whole |= {"confidence": [np.ones(len(points)) for points in POINTS]}
+    assert len(read(**whole)) == 3
+    wrong = (whole[name] * 2)[:length]
+    given = {"confidence": "points_confidence"}.get(name, name)
+    sentence = "a list of 3 entries, one per left image", f"{length} entries"
+    check_error(lambda: read(**whole | {name: wrong}), given, *sentence)
+    if name not in ("E", "points"):
+        by_points = {"right": None, "E": None}
+        check_error(lambda: read(**whole | by_points | {name: wrong}), given, *sentence)
+
+
+@pytest.mark.parametrize("name", ["right", "points"])
+@pytest.mark.parametrize("missing", [(0,), (1,), (2,), (0, 1), (1, 2), (0, 1, 2)])
+def test_right_images_and_points_are_given_for_every_left_image_or_for_none(name, missing):
+    whole = {"right": [IMAGES[0]] * 3, "K": KS[0], "E": ES[1:4], "points": list(POINTS)}
+    holes = {name: [None if i in missing else each for i, each in enumerate(whole[name])]}
+    if name == "right":
+        holes["E"] = [None if i in missing else each for i, each in enumerate(whole["E"])]
+    if len(missing) < 3:
+        expected = "given for every left image or for none"
+        check_error(lambda: read(**whole | holes), name, expected, f"None for {missing[0]}")
+        return
+    found = read(**whole | holes)
+    assert [len(each.views) for each in found] == ([0] * 3 if name == "right" else [1] * 3)
+    assert all((each.points is None) == (name == "points") for each in found)
+
+
+def test_every_view_of_a_list_has_an_image_a_K_and_an_E():
+    whole = [(IMAGES[0], KS[0], ES[0]), (IMAGES[0], KS[0], ES[1]), (IMAGES[0], KS[0], ES[2])]
+    assert len(split_views(whole).rights) == 2
+    form = "a list [(image, K, E), ...] with the left view first"
+    for i in range(3):
+        for wrong, kind in (((IMAGES[0], KS[0]), 2), ((*whole[0], 1), 4), (IMAGES[0], "'ndarray'")):
+            kinds = [3, 3, 3]
+            kinds[i] = kind
+            got = f"3 entries of lengths [{', '.join(map(str, kinds))}]"
+            views = [*whole[:i], wrong, *whole[i + 1 :]]
+            check_error(partial(split_views, views), "views", form, got, "three")
+    check_error(lambda: split_views(whole[:1]), "views", f"{form}, at least two", "1", "no metric scale")
+
+
+@pytest.mark.parametrize(
+    ("matrix", "is_one"),
+    [
+        ([[1, 2], [3, 4]], True),
+        ([(1, 2.5), (3, 4)], True),
+        ([[1, 2], [3, np.float32(4)]], True),
+        ([[1, 2], "ab"], False),
+        ([[1, 2], [3, "a"]], False),
+        ([np.ones(2), np.ones(2)], False),
+        ([np.eye(3), np.eye(3)], False),
+        ([], False),
+    ],
+)
+def test_rows_of_numbers_are_one_matrix_and_other_lists_have_an_entry_per_image(matrix, is_one):
+    assert _is_nested_matrix(matrix) is is_one
+    entries = [_entry(matrix, "K", i, len(matrix)) for i in range(len(matrix))]
+    assert all(entry is (matrix if is_one else matrix[i]) for i, entry in enumerate(entries))
+
+
+def test_confidence_above_1_from_rounding_is_1():
+    points = as_points(np.ones((3, 3)), "points", [0.5, np.nextafter(np.float32(1), np.float32(2)), 1 + 9e-7])
+    assert points[:, 3].tolist() == [0.5, 1.0, 1.0]
+    with pytest.raises(InputError, match=r"got values from 0\.5 to 1\.00001"):
+        as_points(np.ones((2, 3)), "points", [0.5, 1.00001])

@@ -1,10 +1,11 @@
-"""Two cameras that differ in every parameter, so that exchanged or missing values are noticed."""
+"""Two cameras that differ in every parameter, so that swapped or missing values are noticed."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.formats.rigs import CameraChoice
 from geodiff_plugin.types import Rig
+from tests.views import lenses_of
 
 K_LEFT = np.array([[811.5, 0, 402.25], [0, 793.25, 305.5], [0, 0, 1]])
 K_RIGHT = np.array([[902.75, 0, 511.5], [0, 887.5, 333.25], [0, 0, 1]])
@@ -64,9 +65,9 @@ def assert_is_the_pair(
     assert (rig.size_left, rig.size_right) == ((SIZE_LEFT, SIZE_RIGHT) if sizes else (None, None))
     assert not rig.rectified and rig.unit == "m" and rig.measured and rig.as_taken is None
     if lens is None:
-        assert rig.distortion == (None, None)
+        assert lenses_of(rig) == (None, None)
         return
-    for each, expected in zip(rig.distortion, (LENS_LEFT, LENS_RIGHT), strict=True):
+    for each, expected in zip(lenses_of(rig), (LENS_LEFT, LENS_RIGHT), strict=True):
         assert each.model == model
         np.testing.assert_allclose(each.coefficients, expected[:lens], rtol=1e-12)
 
@@ -81,4 +82,4 @@ def assert_is_parallel(
     expected[0, 3] = baseline
     np.testing.assert_allclose(rig.E, expected, atol=1e-12)
     assert (rig.size_left, rig.size_right) == tuple(sizes)
-    assert rig.rectified == rectified and rig.distortion == (None, None)
+    assert rig.rectified == rectified and lenses_of(rig) == (None, None)

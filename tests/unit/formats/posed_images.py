@@ -68,13 +68,13 @@ def assert_is_read(
     depths=None,
     depth_per_m=None,
     as_stored: bool = True,
-    notes=(),
+    findings=(),
     names=None,
 ) -> None:
     """Compare everything a reader returns; ``None`` in ``poses`` is a frame without a pose."""
     assert layout is not None
     assert (layout.kind, layout.unit, layout.as_stored, layout.has_poses) == (kind, unit, as_stored, True)
-    assert [note.code for note in layout.notes] == list(notes)
+    assert [finding.code for finding in layout.findings] == list(findings)
     assert [each.problem for each in layout.candidates] == [""] * len(files)
     frames = [each.frame for each in layout.candidates]
     for record in (layout, layout.candidates[0], frames[0]):

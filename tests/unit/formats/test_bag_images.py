@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError, InputFileError, noted
+from geodiff_plugin._internal.checks import InputError, InputFileError, captured_warnings
 from geodiff_plugin.formats.bag_images import both_as_01, decode_image
 
 PATH = Path("drive.mcap")
@@ -97,7 +97,7 @@ def test_a_bayer_pattern_is_named_by_its_first_pixels(pattern, bits):
     np.testing.assert_array_equal(image[2:-2, 2:-2], np.broadcast_to(expected, (4, 6, 3)))
 
 
-def test_an_image_with_less_than_it_says_is_refused():
+def test_a_truncated_image_is_rejected():
     values = RNG.integers(0, 255, (6, 8, 3), np.uint8)
     whole = message("rgb8", values, pad=0)
     np.testing.assert_array_equal(decode_image(whole, PATH), values)
@@ -108,7 +108,7 @@ def test_an_image_with_less_than_it_says_is_refused():
         ({"width": 9}, "144 bytes, rows of 24"),
     ):
         rows, used = changes.get("height", 6), 3 * changes.get("width", 8)
-        expected = f"an image must be of {rows} rows of {used} bytes .rgb8.; got {got}, in drive.mcap"
+        expected = f"an image must be {rows} rows of {used} bytes .rgb8.; got {got}, in drive.mcap"
         with pytest.raises(InputError, match=expected):
             decode_image(SimpleNamespace(**(vars(whole) | changes)), PATH)
     longer = SimpleNamespace(**(vars(whole) | {"data": np.append(whole.data, 9)}))
@@ -124,14 +124,14 @@ def test_compressed_images_keep_their_bits_and_their_order_of_colours():
         image = decode_image(SimpleNamespace(format="rgb8; png compressed", data=data), PATH)
         assert image.dtype == kind
         np.testing.assert_array_equal(image, values)
-    for form, told in (("H264", True), ("h265", True), ("hevc", True), ("jpeg", False)):
+    for form, reported in (("H264", True), ("h265", True), ("hevc", True), ("jpeg", False)):
         with pytest.raises(
-            InputFileError, match=rf"an image of drive.mcap \({form}\) does not decode\."
+            InputFileError, match=rf"an image of drive\.mcap \({form}\) cannot be decoded\."
         ) as caught:
             decode_image(SimpleNamespace(format=form, data=data[:20]), PATH)
-        assert ("image_transport republish" in str(caught.value)) == told and not str(caught.value).endswith(
-            " "
-        )
+        assert ("image_transport republish" in str(caught.value)) == reported and not str(
+            caught.value
+        ).endswith(" ")
 
 
 @pytest.mark.parametrize(
@@ -150,21 +150,22 @@ def test_both_views_of_16_bits_are_scaled_by_the_bits_of_the_brighter(most, full
     for brighter in (0, 1):
         images = [np.full((2, 3, 3), 500, np.uint16) for _ in range(2)]
         images[brighter][1, 2, 0] = most
-        with noted() as said:
+        with captured_warnings() as said:
             if bits is None:
                 both = both_as_01(images, PATH)
             else:
                 with pytest.warns(
-                    UserWarning, match=f"drive.mcap: Its 16-bit images reach {most}: .* of {bits} bits"
+                    UserWarning,
+                    match=f"drive.mcap: Its 16-bit images have a maximum of {most}, so {bits} bits",
                 ):
                     both = both_as_01(images, PATH)
-        assert [note.code for note in said] == ["image.bits"] * (bits is not None)
+        assert [finding.code for finding in said] == ["image.bits"] * (bits is not None)
         for image, scaled in zip(images, both, strict=True):
             assert scaled.dtype == np.float32
             np.testing.assert_allclose(scaled, image / full, rtol=1e-6)
 
 
-def test_views_of_floats_are_shares_or_levels():
+def test_views_of_floats_are_fractions_or_levels():
     for most, full in ((0.9, 1), (1.0, 1), (1.01, 255), (255.0, 255)):
         images = [np.full((2, 2, 3), 0.25, np.float32), np.full((2, 2, 3), most, np.float32)]
         for scaled, image in zip(both_as_01(images, PATH), images, strict=True):
@@ -172,9 +173,7 @@ def test_views_of_floats_are_shares_or_levels():
     for bad in (255.1, -0.1, np.nan, np.inf):
         images = [np.full((2, 2, 3), 0.5, np.float32) for _ in range(2)]
         images[1][0, 0] = bad
-        with pytest.raises(
-            InputError, match="an image of floats must be of values from 0 to 1, or to 255; got up to"
-        ):
+        with pytest.raises(InputError, match="an image of floats must be in .0, 1. or .0, 255.; got up to"):
             both_as_01(images, PATH)
     bytes_01 = both_as_01([np.full((2, 2, 3), 51, np.uint8), np.full((2, 2, 3), 3, np.uint8)], PATH)
     assert bytes_01[0][0, 0, 0] == np.float32(0.2) and bytes_01[1][0, 0, 0] == pytest.approx(3 / 255)

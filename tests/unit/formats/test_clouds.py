@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin import _strips
+from geodiff_plugin._internal import strips as _strips
+from geodiff_plugin.cameras import PosedCamera
 from geodiff_plugin.formats import clouds
 from geodiff_plugin.formats.clouds import (
     Cloud,
@@ -66,7 +67,7 @@ def test_a_cloud_has_the_point_and_the_colour_of_every_known_pixel_in_order(
     np.testing.assert_array_equal(read.colors[:, :3], colours)
 
 
-def test_a_ply_says_its_frame_and_its_unit(tmp_path):
+def test_a_ply_states_its_frame_and_its_unit(tmp_path):
     for unit, word in (("m", "metres"), (None, "no unit")):
         write_ply(tmp_path / "c.ply", DEPTH, IMAGE, K, unit=unit)
         head = (tmp_path / "c.ply").read_bytes().partition(b"end_header")[0].decode()
@@ -89,6 +90,30 @@ def test_vertices_with_further_numbers_come_back_part_after_part(tmp_path):
     np.testing.assert_allclose(
         np.stack([raw[name] for name in ("nx", "ny", "nz")], axis=-1), normals, rtol=1e-6
     )
+
+
+def test_a_ply_has_the_sigma_of_every_point_after_its_colours(tmp_path):
+    sigma_m = RNG.uniform(0.01, 0.2, DEPTH.shape).astype(np.float32)
+    count = write_ply(tmp_path / "c.ply", DEPTH, IMAGE, K, VALID, sigma_m=sigma_m)
+    vertex = plyfile_like(tmp_path / "c.ply")
+    assert vertex.dtype.names == ("x", "y", "z", "red", "green", "blue", "sigma") and len(vertex) == count
+    known = np.isfinite(DEPTH) & (DEPTH > 0) & VALID
+    np.testing.assert_array_equal(vertex["sigma"], sigma_m[known])
+    np.testing.assert_array_equal(vertex["z"], DEPTH[known].astype(np.float32))
+    read = trimesh.load(tmp_path / "c.ply", process=False)
+    np.testing.assert_allclose(read.vertices[:, 2], DEPTH[known], rtol=1e-6)
+    np.testing.assert_array_equal(
+        read.metadata["_ply_raw"]["vertex"]["data"]["sigma"].ravel(), sigma_m[known]
+    )
+
+
+def plyfile_like(path):
+    """The vertices as a record array, from the header's own types and order, as plyfile reads them."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    types = {"float": "<f4", "uchar": "u1"}
+    words = [line.split() for line in head.decode().splitlines()]
+    row = np.dtype([(name, types[kind]) for first, kind, name in (w for w in words if w[0] == "property")])
+    return np.frombuffer(body, row)
 
 
 def test_colours_in_8_bits_are_rounded_and_clipped():
@@ -140,7 +165,7 @@ E_RIGHT = pose((0.3, -0.2, 0.5), (0.4, -0.1, 0.2))
 
 
 def test_a_pyramid_ends_at_the_outer_edges_of_the_corner_pixels():
-    corners = camera_pyramid(K, E_RIGHT, (W, H), 0.7)
+    corners = camera_pyramid(PosedCamera(K, (W, H), E=E_RIGHT), 0.7)
     in_camera = (corners - E_RIGHT[:3, 3]) @ E_RIGHT[:3, :3]
     np.testing.assert_allclose(in_camera[0], 0, atol=1e-12)
     np.testing.assert_allclose(in_camera[1:, 2], 0.7)
@@ -269,7 +294,7 @@ def test_a_glb_read_by_trimesh_has_the_surface_and_a_pyramid_a_camera(kind, tmp_
     for number, ((k, E, size), colour) in enumerate(zip(cameras, colours, strict=True)):
         drawn = scene.geometry[f"camera {number}"]
         corners = np.unique(in_opencv(np.asarray(drawn.vertices)).round(5), axis=0)
-        expected = camera_pyramid(k, E, size, length)
+        expected = camera_pyramid(PosedCamera(k, size, E=E), length)
         assert len(corners) == 5
         for corner in expected:
             assert np.abs(corners - corner).max(axis=1).min() < 2e-5
@@ -302,3 +327,18 @@ def test_the_texture_of_a_mesh_is_the_image(tmp_path):
     texture = make_mesh(smooth_depth(H, W, 0.02), image, K).visual.material.baseColorTexture
     assert isinstance(texture, Image.Image) and texture.format == "JPEG"
     np.testing.assert_array_equal(np.asarray(texture), np.rint(image * 255))
+
+
+def test_flying_points_keep_planes_and_clean_edges():
+    v, u = np.mgrid[0:30, 0:40]
+    box = (u > 10) & (u < 25) & (v > 8) & (v < 20)
+    for depth in (1.0 / (0.5 - 0.004 * u - 0.003 * v), np.where(u < 20, 1.0, 3.0), np.where(box, 1.0, 3.0)):
+        assert not flying_points(depth).any()
+
+
+@pytest.mark.parametrize("angle", [0, 30, 90])
+def test_flying_points_find_a_ramp_between_two_surfaces(angle):
+    v, u = np.mgrid[0:60, 0:60]
+    across = np.cos(np.deg2rad(angle)) * (u - 30) + np.sin(np.deg2rad(angle)) * (v - 30)
+    flying = flying_points(np.interp(across, [-1.5, 1.5], [1.0, 4.0]))
+    assert flying[np.abs(across) < 1.4].mean() > 0.95 and not flying[np.abs(across) > 3].any()

@@ -1,11 +1,12 @@
-"""COLMAP models: what is written is what pycolmap reads, and what pycolmap writes is read as it says."""
+"""COLMAP models: what is written is what pycolmap reads, and what pycolmap writes is read with its values."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import colmap
+from geodiff_plugin.formats import files as text_files
 from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.colmap import (
     calibration_text,
@@ -17,6 +18,7 @@ from geodiff_plugin.formats.colmap import (
     write_colmap,
 )
 from geodiff_plugin.formats.rigs import CameraChoice
+from tests.unit.error_sentences import check_error
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -158,7 +160,7 @@ def test_the_pose_of_a_pair_is_that_of_the_right_camera_in_the_left_ones_frame(m
 
 
 def test_an_export_without_sight_lines_is_thinned_and_has_no_tracks(tmp_path, monkeypatch):
-    monkeypatch.setattr(colmap, "MOST_POINTS", 33)
+    monkeypatch.setattr(colmap, "MAX_POINTS", 33)
     write_colmap(tmp_path, VIEWS, CLOUD)
     theirs = pycolmap.Reconstruction(str(tmp_path))
     assert len(theirs.points3D) == 33 and all(p.track.length() == 0 for p in theirs.points3D.values())
@@ -199,8 +201,8 @@ def test_parameters_are_focal_lengths_then_the_centre_then_the_lens(name):
     assert camera.model == ("fisheye" if "FISHEYE" in name else "opencv")
 
 
-def test_cameras_that_cannot_be_used_say_why():
-    with pytest.raises(InputError, match="camera 3 must be one with a focal length; got EQUIRECTANGULAR"):
+def test_cameras_that_cannot_be_used_state_the_reason():
+    with pytest.raises(InputError, match="camera 3 must be a model with a focal length; got EQUIRECTANGULAR"):
         colmap.model_camera("3", "EQUIRECTANGULAR", (64, 48), "64 48")
     with pytest.raises(InputError, match="camera 3 must be one of SIMPLE_PINHOLE.*got MADE_UP"):
         colmap.model_camera("3", "MADE_UP", (64, 48), "64 48")
@@ -216,7 +218,7 @@ def files(folder, numbers) -> None:
     write_colmap(folder, [VIEWS[n] for n in numbers], CLOUD, [SEEN[n] for n in numbers])
 
 
-def pictures(folder, names=tuple(name for name, *_ in VIEWS)) -> None:
+def rgb_images(folder, names=tuple(name for name, *_ in VIEWS)) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
         (folder / name).write_bytes(b"0")
@@ -230,12 +232,14 @@ def test_of_several_models_the_largest_is_read_with_its_own_points_and_the_other
     files(tmp_path / "sparse" / "0", (0, 1))
     files(tmp_path / "sparse" / "1", (1, 2, 3))
     files(tmp_path / "sparse" / "2", (0, 2, 3))
-    pictures(tmp_path / "images")
+    rgb_images(tmp_path / "images")
     layout = read_colmap_capture(tmp_path)
     assert [c.frame.image.name for c in layout.candidates] == [VIEWS[n][0] for n in (1, 2, 3)]
-    (note,) = layout.notes
-    assert "sparse/1, with 3 images, is used, the largest of 3 models" in note
-    assert "left out: sparse/0 with 2, sparse/2 with 3." in note and layout.unit is None and layout.as_stored
+    (finding,) = layout.findings
+    assert "sparse/1, with 3 images, is used, the largest of 3 models" in finding
+    assert (
+        "ignored: sparse/0 with 2, sparse/2 with 3." in finding and layout.unit is None and layout.as_stored
+    )
     for candidate, number in zip(layout.candidates, (1, 2, 3), strict=True):
         np.testing.assert_allclose(candidate.frame.E, pose(number), atol=1e-8)
         np.testing.assert_allclose(candidate.camera.K, intrinsics(number), atol=1e-6)
@@ -252,17 +256,17 @@ def test_images_of_a_model_are_looked_for_up_to_three_folders_above_it(up, tmp_p
     place = folder
     for _ in range(up):
         place = place.parent
-    pictures(place / "input")
+    rgb_images(place / "input")
     layout = read_colmap_capture(folder)
-    assert (len(found(layout)), layout.notes) == (2 if up < 4 else 0, ())
+    assert (len(found(layout)), layout.findings) == (2 if up < 4 else 0, ())
 
 
 def test_a_project_takes_the_images_of_the_first_model_that_has_them_and_none_from_above(tmp_path):
     project = tmp_path / "project"
     files(project / "sparse", (0, 1, 2))
     files(project / "dense" / "sparse", (2, 3))
-    pictures(tmp_path, (VIEWS[0][0],))  # of somebody else: above the project
-    pictures(project / "dense" / "images", (VIEWS[2][0], VIEWS[3][0]))
+    rgb_images(tmp_path, (VIEWS[0][0],))  # of somebody else: above the project
+    rgb_images(project / "dense" / "images", (VIEWS[2][0], VIEWS[3][0]))
     layout = read_colmap_capture(project)
     assert [c.frame.name for c in layout.candidates] == ["view-2", "view-3"] and len(found(layout)) == 2
     given = read_colmap_capture(project, project / "dense" / "images")
@@ -272,7 +276,7 @@ def test_a_project_takes_the_images_of_the_first_model_that_has_them_and_none_fr
     assert all(c.frame.points is None for c in read_colmap_capture(project / "sparse").candidates)
 
 
-def test_a_text_model_by_other_names_is_read_by_its_first_line_and_a_cut_off_one_is_refused(model, tmp_path):
+def test_a_text_model_by_other_names_is_read_by_its_first_line_and_a_cut_off_one_is_rejected(model, tmp_path):
     text = (model / "images.txt").read_text()
     other = tmp_path / "poses.txt"
     other.write_text("\ufeff" + text)
@@ -284,15 +288,58 @@ def test_a_text_model_by_other_names_is_read_by_its_first_line_and_a_cut_off_one
     assert [line for line in calibration_text(tmp_path / "images.txt").splitlines() if line] == lines
     (tmp_path / "images.txt").write_text("# nothing")
     with pytest.raises(
-        InputError, match="calibration must be images.txt of a COLMAP model; got .* without a line"
+        InputError, match="calibration must be images.txt of a COLMAP model; got .* without images"
     ):
         calibration_text(tmp_path / "images.txt")
 
 
-def test_a_binary_camera_of_a_model_that_is_not_known_is_refused_by_its_number(binary, tmp_path):
+def test_a_binary_camera_of_a_model_that_is_not_known_is_rejected_by_its_number(binary, tmp_path):
     raw = bytearray((binary / "cameras.bin").read_bytes())
     for number in (18, 255):
         raw[12] = number
         (tmp_path / "cameras.bin").write_bytes(raw)
         with pytest.raises(InputError, match=f"camera models 0 to 17 of COLMAP; got {number}"):
             calibration_text(tmp_path / "cameras.bin")
+
+
+def test_a_file_of_images_may_be_longer_than_any_other_text(model, tmp_path, monkeypatch):
+    """Its lines of keypoints, which are not kept, are most of it; a file of cameras is short."""
+    monkeypatch.setattr(text_files, "LARGEST_TEXT_BYTES", 500)
+    kept = calibration_text(model / "images.txt")
+    assert (model / "images.txt").stat().st_size > 500
+    assert [line.split()[-1] for line in kept.splitlines()[1:] if line] == [view[0] for view in VIEWS]
+    (tmp_path / "poses.txt").write_text((model / "images.txt").read_text())
+    assert calibration_text(tmp_path / "poses.txt") == kept
+    cameras = (model / "cameras.txt").read_text()
+    (tmp_path / "cameras.txt").write_text(cameras + "# more\n" * 100)
+    size = (tmp_path / "cameras.txt").stat().st_size
+    path = tmp_path / "cameras.txt"
+    check_error(
+        lambda: calibration_text(path), "calibration", "a calibration file", f"{path} of {size} bytes"
+    )
+    (tmp_path / "cameras.txt").write_text(cameras[:500])
+    assert calibration_text(tmp_path / "cameras.txt") == cameras[:500]
+
+
+def test_a_binary_file_that_is_cut_off_anywhere_is_rejected_by_its_name(binary, tmp_path):
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        raw = (binary / name).read_bytes()
+        path = tmp_path / name
+        read = (
+            (lambda: read_points(tmp_path))
+            if name == "points3D.bin"
+            else (lambda p=path: calibration_text(p))
+        )
+        path.write_bytes(raw)
+        read()
+        for length in (7, 9, len(raw) // 2, len(raw) - 1):
+            path.write_bytes(raw[:length])
+            check_error(read, str(path), "a binary COLMAP file", "too few bytes", "It may be truncated.")
+
+
+def test_a_camera_number_that_the_model_lacks_is_named_with_those_that_it_has():
+    model = colmap.Model({3: None, 5: None}, {4: "it is a panorama."}, {})
+    check_error(lambda: model.camera(9), "the cameras", "with camera 9", "only 3, 5")
+    check_error(lambda: colmap.Model({}, {}, {}).camera(9), "the cameras", "with camera 9", "only none")
+    with pytest.raises(InputError, match="^it is a panorama.$"):
+        model.camera(4)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import datasets
 from tests.unit.formats.calibrated_pair import pose, quaternion, words
 from tests.unit.formats.posed_images import KS, POSES, SIZES, assert_is_read, numbers, write_images
@@ -15,7 +15,7 @@ T_BODY_CAMERA = pose((-74, 12, 95), (0.05, -0.04, 0.07))
 START_NS = 1_403_636_579_763_555_584
 
 
-def write_euroc(folder, truth="state_groundtruth_estimate0", stamps=None):
+def write_euroc(folder, ground_truth="state_groundtruth_estimate0", stamps=None):
     """Poses are of the body, with ``w`` first in quaternions."""
     stamps = stamps or [START_NS + n * 50_000_000 for n in range(3)]
     files = write_images(folder / "cam0" / "data", [f"{ns}.png" for ns in stamps])
@@ -34,25 +34,25 @@ def write_euroc(folder, truth="state_groundtruth_estimate0", stamps=None):
         body = E @ np.linalg.inv(T_BODY_CAMERA)
         x, y, z, w = quaternion(body)
         rows += f"{START_NS + n * 50_000_000},{words([*body[:3, 3], w, x, y, z, 9, 9], ',')}\n"
-    (folder / truth).mkdir(parents=True, exist_ok=True)
-    (folder / truth / "data.csv").write_text(f"#head\n{rows}")
+    (folder / ground_truth).mkdir(parents=True, exist_ok=True)
+    (folder / ground_truth / "data.csv").write_text(f"#head\n{rows}")
     return files, {"Ks": [KS[1]] * 3, "sizes": [SIZES[1]] * 3, "lenses": [lens] * 3, "models": ["radtan"] * 3}
 
 
 @pytest.mark.parametrize(
-    ("below", "truth"),
+    ("below", "ground_truth"),
     [("mav0", "state_groundtruth_estimate0"), ("", "mocap0"), ("mav0", "gt0"), ("", "leica0")],
 )
-def test_euroc_image_poses_combine_body_pose_and_camera_mount(tmp_path, below, truth):
-    files, expected = write_euroc(tmp_path / below, truth)
+def test_euroc_image_poses_combine_body_pose_and_camera_mount(tmp_path, below, ground_truth):
+    files, expected = write_euroc(tmp_path / below, ground_truth)
     assert_is_read(datasets.read_euroc(tmp_path), "EuRoC", "m", files, **expected)
     (tmp_path / below / "cam1").mkdir()
-    assert_is_read(datasets.read_euroc(tmp_path), "EuRoC", "m", files, **expected, notes=["capture.part"])
-    (tmp_path / below / truth / "data.csv").unlink()
+    assert_is_read(datasets.read_euroc(tmp_path), "EuRoC", "m", files, **expected, findings=["capture.part"])
+    (tmp_path / below / ground_truth / "data.csv").unlink()
     with pytest.raises(
         InputError,
         match=r"\Aa sequence of EuRoC must be with ground truth \(state_groundtruth_esti"
-        r"mate0/data\.csv or .*\); got .* without\. Give .*cam0/data with --K to solve",
+        r"mate0/data\.csv or .*\); got .* without\. Pass .*cam0/data with --K to solve",
     ):
         datasets.read_euroc(tmp_path)
     (tmp_path / below / "cam0" / "sensor.yaml").unlink()
@@ -80,7 +80,7 @@ def test_tartanair_poses_use_ned_axes(tmp_path):
     assert_is_read(layout, "TartanAir", "m", files, Ks=[K] * 3, sizes=[(640, 480)] * 3, depths=depths)
     (tmp_path / "pose_left.txt").write_text("\n".join(rows[:2]))
     with pytest.raises(
-        InputError, match=r"\Apose_left\.txt must be of 3 lines, one for each image; got 2\.\Z"
+        InputError, match=r"\Apose_left\.txt must be a file with 3 lines, one per image; got 2\.\Z"
     ):
         datasets.read_tartanair(tmp_path)
     (tmp_path / "pose_left.txt").unlink()
@@ -130,17 +130,17 @@ def test_mvsnet_folder_poses_are_world_to_camera(tmp_path, folder):
         T = np.linalg.inv(POSES[n])
         text = f"extrinsic\n{words(T)}\n\nintrinsic\n{words(KS[n])}\n\n425.0 2.5 192 935.0\n"
         (tmp_path / "cams" / f"{name}_cam.txt").write_text(text)
-    assert_is_read(datasets.read_mvsnet_folder(tmp_path), "MVSNet", None, files, sizes=None)
+    assert_is_read(datasets.MVSNET_FOLDER(tmp_path), "MVSNet", None, files, sizes=None)
     (tmp_path / "cams" / "11_cam.txt").unlink()
-    candidates = datasets.read_mvsnet_folder(tmp_path).candidates
+    candidates = datasets.MVSNET_FOLDER(tmp_path).candidates
     assert "the camera of 11" in candidates[1].problem and not candidates[2].problem
     for file in (tmp_path / "cams").iterdir():
         file.unlink()
-    assert datasets.read_mvsnet_folder(tmp_path) is None
+    assert datasets.MVSNET_FOLDER(tmp_path) is None
     (tmp_path / "cams" / "11_cam.txt").write_text("x")
     for file in files:
         file.unlink()
-    assert datasets.read_mvsnet_folder(tmp_path) is None
+    assert datasets.MVSNET_FOLDER(tmp_path) is None
 
 
 def log_text(numbers_=(0, 1, 2), registered=(5, 0, 6)) -> str:
@@ -162,13 +162,14 @@ def test_tanks_and_temples_poses_are_indexed_by_image_number(tmp_path, folder):
     for number in (3, -1):
         (tmp_path / "scene.log").write_text(log_text((0, 1, number)))
         with pytest.raises(
-            InputError, match=rf"\Ascene\.log must be of the 3 images beside it; got a frame {number}\."
+            InputError,
+            match=rf"\Ascene\.log must be a log of the 3 images next to it; got a frame {number}\.",
         ):
             datasets.read_log(tmp_path)
     for file in files:
         file.unlink()
     with pytest.raises(
-        InputError, match=r"\APATH must be a \.log with its images beside it or in images/; got .*scene"
+        InputError, match=r"\APATH must be a \.log with its images next to it or in images/; got .*scene"
     ):
         datasets.read_log(tmp_path)
 

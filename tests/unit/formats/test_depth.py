@@ -3,10 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from geodiff_plugin import _strips
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal import strips as _strips
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import depth as module
 from geodiff_plugin.formats.depth import (
     depth_mm,
@@ -20,7 +23,9 @@ from geodiff_plugin.formats.depth import (
     write_depth_npy,
     write_pfm,
 )
+from geodiff_plugin.formats.maps import read_pfm
 from geodiff_plugin.types import Rig
+from tests.views import made_rig
 
 RNG = np.random.default_rng(4)
 WHOLE = np.array([[0, 1, 255, 256], [1234, 65534, 65535, 40000]], np.uint16)
@@ -28,7 +33,7 @@ FLOATS = np.array([[1.5, 0.0, -2.0, np.nan], [np.inf, 65535.0, -np.inf, 0.25]], 
 
 
 def save(path, values: np.ndarray):
-    """A map in the format that the suffix says, written by other programs than ours."""
+    """A map in the format of the suffix, written by other programs than ours."""
     if path.suffix == ".npy":
         np.save(path, values)
     elif path.suffix == ".npz":
@@ -69,7 +74,7 @@ def test_whole_numbers_of_32_bits_have_no_largest_value(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy", ".pfm", ".npz"])
-def test_the_map_of_a_model_is_unknown_where_a_picture_is_0_and_where_floats_are_not_finite(suffix, tmp_path):
+def test_the_map_of_a_model_is_unknown_where_an_image_is_0_and_where_floats_are_not_finite(suffix, tmp_path):
     values = WHOLE if suffix == ".png" else FLOATS
     expected = values.astype(float)
     if suffix in (".png", ".tiff"):
@@ -81,7 +86,7 @@ def test_the_map_of_a_model_is_unknown_where_a_picture_is_0_and_where_floats_are
         np.testing.assert_array_equal(read_map(tmp_path / "w.npy"), [[-3, 0], [4, 70000]])
 
 
-def test_confidences_of_every_kind_are_shares(tmp_path):
+def test_confidences_of_every_type_are_fractions(tmp_path):
     levels = RNG.random((5, 7)).astype(np.float32)
     np.save(tmp_path / "c.npy", levels[..., None])
     write_pfm(tmp_path / "c.pfm", levels)
@@ -123,7 +128,7 @@ def rig(baseline: float = 0.31, unit: str | None = "m") -> Rig:
     K_right = K_left + np.array([[0, 0, 4.25], [0, 0, 0], [0, 0, 0]])
     E = np.eye(4)
     E[0, 3] = baseline
-    return Rig(K_left, K_right, E, (60, 40), (60, 40), unit=unit, source="made.txt")
+    return made_rig(K_left, K_right, E, ((60, 40), (60, 40)), unit=unit, source="made.txt")
 
 
 def point_disparity(rig: Rig, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -179,12 +184,12 @@ def test_depth_of_a_disparity_map_in_the_size_of_the_image_or_scaled(rows, colum
     assert (got[(row == 2) & (column == 3)] == 0).all() and got.dtype == np.float32
 
 
-def test_a_disparity_says_what_it_lacks(tmp_path):
+def test_a_disparity_states_what_is_missing(tmp_path):
     write_pfm(tmp_path / "d.pfm", np.full((40, 60), 7.0))
     for change, said in (
-        ({"rig": rig(unit=None)}, "disparity must be of a rig in metres; got the rig of made.txt"),
+        ({"rig": rig(unit=None)}, "disparity must be used with a rig in metres; got the rig of made.txt"),
         ({"rig": rig(baseline=-0.3)}, "disparity must be of a rectified pair; got the rig of made.txt"),
-        ({"size": (60, 42)}, "a map of the shape of the left image, 60x42 pixels; got .* of 60x40"),
+        ({"size": (60, 42)}, "a map with the aspect ratio of the left image, 60x42 pixels; got .* of 60x40"),
         ({"per_px": 0.0}, "disparity: units per pixel"),
     ):
         given = {"rig": rig(), "size": (60, 40), "per_px": None} | change
@@ -196,14 +201,14 @@ def test_a_disparity_says_what_it_lacks(tmp_path):
         )  # settings are given by name
     assert depth_of_disparity(tmp_path / "d.pfm", rig(), (121, 80)).shape == (80, 121), "sides may be rounded"
     np.save(tmp_path / "w.npy", np.full((40, 60), 160))
-    with pytest.raises(InputError, match=r"in pixels as floats; got .* of int64. .* give --points-scale 16"):
+    with pytest.raises(InputError, match=r"in pixels as floats; got .* of int64. .* pass --points-scale 16"):
         depth_of_disparity(tmp_path / "w.npy", rig(), (60, 40))
 
 
 @pytest.mark.parametrize(
     ("negative", "refused"), [(0, False), (9, False), (10, False), (11, True), (20, True)]
 )
-def test_disparities_of_which_most_are_negative_are_refused(negative, refused, tmp_path):
+def test_disparities_of_which_most_are_negative_are_rejected(negative, refused, tmp_path):
     values = np.zeros((5, 8))
     values.flat[:20] = 6.0
     values.flat[:negative] = -6.0
@@ -211,7 +216,7 @@ def test_disparities_of_which_most_are_negative_are_refused(negative, refused, t
     np.save(tmp_path / "d.npy", values)
     cameras = rig()
     if refused:
-        with pytest.raises(InputError, match="above 0: the column in the left image minus that in the right"):
+        with pytest.raises(InputError, match="positive .column in the left image minus column in the right"):
             depth_of_disparity(tmp_path / "d.npy", cameras, (8, 5))
         return
     depth_m = depth_of_disparity(tmp_path / "d.npy", cameras, (8, 5))
@@ -242,3 +247,36 @@ def test_a_rig_may_be_off_by_a_thousandth_of_its_baseline_or_of_a_metre():
             else:
                 with pytest.raises(InputError, match="x must be of a rectified pair; got y"):
                     module._baseline(E, "x", "y")
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    values=arrays(
+        np.float32,
+        st.tuples(st.integers(1, 9), st.integers(1, 9)),
+        elements=st.floats(width=32, allow_nan=False),
+    )
+)
+def test_pfm_comes_back_as_opencv_has_it(tmp_path, values):
+    path = tmp_path / "a.pfm"
+    write_pfm(path, values)
+    np.testing.assert_array_equal(read_pfm(path), values)
+    np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), values)
+    cv2.imwrite(str(path), values)
+    np.testing.assert_array_equal(read_pfm(path), values)
+    head = f"Pf\n{values.shape[1]} {values.shape[0]}\n1.0\n".encode()
+    path.write_bytes(head + values[::-1].astype(">f4").tobytes())
+    np.testing.assert_array_equal(read_pfm(path), values)
+
+
+def test_depth_in_metres_and_millimetres_comes_back(tmp_path):
+    depth = np.array([[0.0004, 1.2344, 65.535], [65.536, np.nan, -np.inf], [np.inf, -1.0, 0.001]])
+    write_depth_npy(tmp_path / "d.npy", depth)
+    np.testing.assert_array_equal(np.load(tmp_path / "d.npy", allow_pickle=False), depth.astype(np.float32))
+    zeros = write_depth_mm(tmp_path / "d.png", depth)
+    read, known = read_depth_png(tmp_path / "d.png")
+    np.testing.assert_allclose(read, [[0, 1.234, 65.535], [0, 0, 0], [0, 0, 0.001]], atol=1e-6)
+    np.testing.assert_array_equal(known, read > 0)
+    assert zeros == 6 == int((~known).sum())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d.npy", "d.png"]
+    np.testing.assert_array_equal(read_depth_png(tmp_path / "d.png", 500.0)[0], 2 * read)

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import image_files
 from geodiff_plugin.formats.image_files import (
+    colmap_mask,
     files_of,
     find_images,
+    find_mask,
     find_moved,
     image_folders,
     images_in,
@@ -171,7 +173,7 @@ def test_of_files_of_one_name_the_one_that_shares_most_of_the_path_is_meant(tmp_
     assert relative(tmp_path, moved.files) == ["x/a/set/f1.jpg", "x/a/set/f2.png", "x/f3.jpg"]
     assert moved.below == tmp_path / "x"
     with pytest.raises(
-        InputError, match=r"the images must be files that names tell apart; got .* and .* for set/f1"
+        InputError, match=r"the images must be files with unambiguous names; got .* and .* for set/f1"
     ):
         find_moved(["set/f1.jpg"], tmp_path, 0)
     names = ["a/set/f1.jpg", "b/set/f1.jpg"]
@@ -188,5 +190,29 @@ def test_an_end_of_the_same_suffix_goes_before_another_suffix(tmp_path):
 def test_a_huge_folder_is_not_listed_to_its_end(tmp_path, monkeypatch):
     touch(tmp_path, *(f"a/f{n}.jpg" for n in range(4)), "b/1", "b/2")
     for most, found in ((8, True), (7, True), (5, False)):
-        monkeypatch.setattr(image_files, "MOST_LISTED", most)
+        monkeypatch.setattr(image_files, "MAX_LISTED", most)
         assert (find_moved(NAMES, tmp_path, 0) is not None) == found
+
+
+def test_a_mask_has_the_name_of_its_image_and_its_folders(tmp_path):
+    touch(tmp_path, "a.png", "b.jpg.png", "cam1/a.png", "c.bmp")
+    image = Path("/scan/images")
+    assert find_mask(tmp_path, image / "a.jpg") == tmp_path / "a.png"
+    assert find_mask(tmp_path, image / "b.jpg") == tmp_path / "b.jpg.png"
+    assert find_mask(tmp_path, image / "c.jpg") == tmp_path / "c.bmp"
+    assert find_mask(tmp_path, image / "cam1/a.jpg") == tmp_path / "cam1/a.png"
+    assert find_mask(tmp_path, image / "cam2/a.jpg") == tmp_path / "a.png"
+    assert (
+        find_mask(tmp_path, image / "d.jpg") is None
+        and find_mask(tmp_path, Path("/a.jpg")) == tmp_path / "a.png"
+    )
+
+
+def test_masks_of_colmap_are_next_to_the_image_folder(tmp_path):
+    touch(tmp_path, "masks/a.jpg.png", "masks/cam/b.png.png", "flat/masks/c.jpg.png", "masks/e.png")
+    images = tmp_path / "images"
+    assert colmap_mask(images / "a.jpg") == tmp_path / "masks/a.jpg.png"
+    assert colmap_mask(images / "cam/b.png") == tmp_path / "masks/cam/b.png.png"
+    assert colmap_mask(tmp_path / "flat/c.jpg") == tmp_path / "flat/masks/c.jpg.png"
+    for name in ("cam/a.jpg", "b.png", "e.jpg"):
+        assert colmap_mask(images / name) is None

@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import layouts
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images
 from tests.unit.formats.posed_images import write_images
@@ -18,36 +17,36 @@ from tests.unit.formats.posed_images import write_images
         ([7, 0, 0], None),
         (
             [9, 4, 0, 1],
-            "The largest part, of 9 images, is used. Others are left out, as each has a frame of its own: "
-            "those of 4, 1 images.",
+            "The largest part, with 9 images, is used. Others (with 4, 1 images) are ignored, as each has "
+            "a separate coordinate frame.",
         ),
         (
             [2, 2],
-            "The largest part, of 2 images, is used. Others are left out, as each has a frame of its own: "
-            "those of 2 images.",
+            "The largest part, with 2 images, is used. Others (with 2 images) are ignored, as each has "
+            "a separate coordinate frame.",
         ),
     ],
 )
 def test_omitted_parts_are_counted(images, reported):
-    notes = layouts.largest_part_notes("part", images)
-    assert [str(note) for note in notes] == ([] if reported is None else [reported])
-    assert all(note.code == "capture.part" for note in notes)
+    findings = layouts.largest_part_findings("part", images)
+    assert [str(finding) for finding in findings] == ([] if reported is None else [reported])
+    assert all(finding.code == "capture.part" for finding in findings)
 
 
 def test_errors_in_a_frame_exclude_only_that_frame():
     frame = CaptureFrame("a", Path("a.png"))
 
     def fail(error):
-        def build(frame):
+        def build(frame, entry):
             raise error
 
-        return layouts.build_frame(frame, build)
+        return layouts.build_frame(frame, build, None)
 
-    assert layouts.build_frame(frame, lambda frame: Candidate(frame, problem="x")).problem == "x"
+    assert layouts.build_frame(frame, lambda frame, x: Candidate(frame, problem=x), "x").problem == "x"
     for error, problem in (
         (InputError("K is bad"), "K is bad"),
-        (KeyError("K"), "its entries do not read (KeyError: 'K')"),
-        (ZeroDivisionError("by 0"), "its entries do not read (ZeroDivisionError: by 0)"),
+        (KeyError("K"), "its entries cannot be read (KeyError: 'K')"),
+        (ZeroDivisionError("by 0"), "its entries cannot be read (ZeroDivisionError: by 0)"),
     ):
         candidate = fail(error)
         assert (candidate.frame, candidate.camera, candidate.problem) == (frame, None, problem)
@@ -55,11 +54,10 @@ def test_errors_in_a_frame_exclude_only_that_frame():
 
 def test_frame_and_layout_defaults():
     frame = CaptureFrame("a", Path("a.png"))
-    assert (frame.E, frame.depth, frame.depth_per_m, frame.index, frame.points, frame.lens) == (None,) * 6
-    assert frame.size == (0, 0) and not frame.as_stored
-    np.testing.assert_array_equal(frame.K, np.eye(3))
+    assert (frame.E, frame.depth, frame.depth_per_m, frame.index, frame.points) == (None,) * 5
+    assert not frame.as_stored
     layout = layouts.Layout("kind", "m", [])
-    assert (layout.as_stored, layout.notes, layout.has_poses) == (True, (), True)
+    assert (layout.as_stored, layout.findings, layout.has_poses) == (True, (), True)
     entry = layouts.CaptureFormat("s", ("m",), lambda path: None)
     assert (entry.names_images, entry.has_poses) == (False, True)
 
@@ -72,7 +70,7 @@ def test_images_are_found_and_duplicate_names_are_skipped(scan):
     a, b = write_images(scan / "images", ["a.png", "b.jpg"])
     names = ["set/a.png", "b.png", "set/a.png", "sub\\c.png"]
     images = Images(names, [scan, scan / "images"], scan / "model.txt")
-    assert images.names == names and images.notes == ()
+    assert images.names == names and images.findings == ()
     assert [images.file(name) for name in names] == [a, b, a, None]
     candidates = images.candidates(build, "wxyz")
     assert [each.frame.image for each in candidates] == [a, b, Path("set/a.png"), Path("sub/c.png")]
@@ -94,16 +92,16 @@ def test_moved_images_are_searched_up_to_two_folders_above(scan):
     images = Images(["a.png", "b.png"], [file.parent], file)
     assert [images.file(name) for name in ("a.png", "b.png")] == [None, None]
     problem = images.candidates(build, "xy")[0].problem
-    assert problem == "no image file in its folder or elsewhere near it: say where they lie (--images)"
+    assert problem == "no image file in its folder or elsewhere near it; pass their folder (--images)"
     file = scan / "cameras.txt"
     images = Images(["a.png", "b.png"], [scan], file)
     assert [images.file(name) for name in ("a.png", "b.png")] == moved
-    (note,) = images.notes
-    assert note.code == "capture.images-found"
-    assert note == "The images are those below ../photos/set, since there is none in its folder."
+    (finding,) = images.findings
+    assert finding.code == "capture.images-found"
+    assert finding == "Images are read from ../photos/set, because its folder has none."
     assert Images(["a.png"], [scan], file, other=("photos",)).file("a.png") is None
     by_folder = Images(["a.png", "b.png"], [scan], scan)
-    assert by_folder.notes[0] == note
+    assert by_folder.findings[0] == finding
 
 
 def test_a_given_folder_is_searched_exclusively(scan):
@@ -114,12 +112,13 @@ def test_a_given_folder_is_searched_exclusively(scan):
     assert images.file("a.png") == there[0] != here[0] and images.file("b.png") is None
     assert images.candidates(build, "xy")[1].problem == "no image file in ../photos/set"
     below = Images(["a.png"], [scan], scan / "cameras.txt", scan.parent / "photos")
-    assert below.file("a.png") == there[0] and below.notes == ()
+    assert below.file("a.png") == there[0] and below.findings == ()
     (scan.parent / "empty").mkdir()
     none = Images(["b.png"], [scan], scan / "cameras.txt", scan.parent / "empty")
     assert none.file("b.png") is None
     with pytest.raises(
-        InputError, match=r"\Aimages \(--images\) must be a folder; got .*a\.png, which is none\. Give"
+        InputError,
+        match=r"\Aimages \(--images\) must be a folder; got .*a\.png, which is not a folder\. Pass",
     ):
         Images(["a.png"], [scan], scan / "cameras.txt", here[0])
     assert Images([], [scan], scan / "cameras.txt").candidates(build, "") == []

@@ -1,10 +1,15 @@
 """KITTI's lidar: the transform to the left camera, and rejected files."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import lidar
+from tests.fuzz.test_fuzz import EXAMPLES, damaged, is_recoverable
 from tests.unit.formats.calibrated_pair import K_LEFT, K_RIGHT, pose, words
 
 LIDAR = pose((91, -3, -88), (0.27, -0.08, -0.3))  # maps lidar points to unrectified camera 0
@@ -39,16 +44,22 @@ def texts():
     }
 
 
+def raw(folder) -> tuple[Path, Path]:
+    """A scan and the calibration of raw data, with that of the lidar next to it."""
+    SCAN.tofile(folder / "s.bin")
+    (folder / "calib.txt").write_text(texts()["raw"])
+    pose_text = f"R: {words(LIDAR[:3, :3])}\nT: {words(LIDAR[:3, 3])}\n"
+    (folder / "calib_velo_to_cam.txt").write_text(pose_text)
+    return folder / "s.bin", folder / "calib.txt"
+
+
 @pytest.mark.parametrize(
     ("kind", "left"),
     [("odometry", 1), ("object", 0), ("object", 3), ("tracking", 2), ("raw", 2), ("raw", 0)],
 )
 def test_scans_are_transformed_to_the_left_camera(tmp_path, kind, left):
-    SCAN.tofile(tmp_path / "s.bin")
+    raw(tmp_path)
     (tmp_path / "calib.txt").write_text(texts()[kind])
-    if kind == "raw":
-        pose_text = f"R: {words(LIDAR[:3, :3])}\nT: {words(LIDAR[:3, 3])}\n"
-        (tmp_path / "calib_velo_to_cam.txt").write_text(pose_text)
     points = lidar.read_lidar(tmp_path / "s.bin", [tmp_path / "calib.txt"], (left, (left + 1) % 4))
     assert points.dtype == np.float32
     np.testing.assert_allclose(points, expected(left), atol=2e-5)
@@ -61,41 +72,41 @@ def test_scans_are_transformed_to_the_left_camera(tmp_path, kind, left):
     ("data", "got"),
     [
         (SCAN.tobytes()[:-4], r"s\.bin of 956 bytes"),
-        (np.where(np.arange(4) == 3, 1.001, SCAN).astype("<f4").tobytes(), r"s\.bin of other numbers"),
-        (np.where(np.arange(4) == 3, -0.001, SCAN).astype("<f4").tobytes(), r"s\.bin of other numbers"),
-        (np.full((2, 4), np.inf, "<f4").tobytes(), r"s\.bin of other numbers"),
+        (np.where(np.arange(4) == 3, 1.001, SCAN).astype("<f4").tobytes(), r"s\.bin with other numbers"),
+        (np.where(np.arange(4) == 3, -0.001, SCAN).astype("<f4").tobytes(), r"s\.bin with other numbers"),
+        (np.full((2, 4), np.inf, "<f4").tobytes(), r"s\.bin with other numbers"),
     ],
 )
-def test_files_with_other_content_are_refused(tmp_path, data, got):
+def test_files_with_other_content_are_rejected(tmp_path, data, got):
     (tmp_path / "s.bin").write_bytes(data)
     sentence = (
         r"\Alidar must be points of KITTI's lidar: x, y, z and a reflectance in \[0, 1\] as float32; got "
     )
-    with pytest.raises(InputError, match=rf"{sentence}.*{got}\. Points of another program: save them"):
+    with pytest.raises(InputError, match=rf"{sentence}.*{got}\. For other points, save them"):
         lidar.read_lidar(tmp_path / "s.bin", [tmp_path / "calib.txt"], name="lidar")
 
 
 def test_the_calibration_must_contain_the_lidar_pose(tmp_path):
     SCAN.tofile(tmp_path / "s.bin")
     calib = tmp_path / "calib.txt"
-    for given in ([], [calib, calib]):
+    for calibrations in ([], [calib, calib]):
         with pytest.raises(
             InputError,
-            match=r"\Apoints must be points of the left camera, or of KITTI's lidar with its "
-            r"calibration; got .*s\.bin\. Give KITTI's",
+            match=r"\Apoints must be points of the left camera, or KITTI's lidar with its "
+            r"calibration; got .*s\.bin\. Pass KITTI's",
         ):
-            lidar.read_lidar(tmp_path / "s.bin", given)
+            lidar.read_lidar(tmp_path / "s.bin", calibrations)
     text = texts()["object"]
     for content, words_ in (
         (
             projections() + "R0_rect: 1\n",
-            r"calibration must be one that says where the lidar is; got .*calib\.txt alone\. "
-            r"Give KITTI's",
+            r"calibration must be a calibration with the lidar's pose; got .*calib\.txt alone\. "
+            r"Pass KITTI's",
         ),
         (
             text.replace("R0_rect", "R1_rect"),
-            r"calibration must be one with R_rect_00 or R0_rect; got .*calib\.txt "
-            r"without\. Give KITTI's",
+            r"calibration must be a file with R_rect_00 or R0_rect; got .*calib\.txt "
+            r"without\. Pass KITTI's",
         ),
         (text.replace("R0_rect: ", "R0_rect: 1 "), r"R0_rect must be 9 finite numbers; got 10"),
         (
@@ -106,3 +117,17 @@ def test_the_calibration_must_contain_the_lidar_pose(tmp_path):
         calib.write_text(content)
         with pytest.raises(InputError, match=words_):
             lidar.read_lidar(tmp_path / "s.bin", [calib], (0, 1))
+
+
+@pytest.mark.parametrize("file", ["s.bin", "calib.txt", "calib_velo_to_cam.txt"])
+def test_damaged_files_of_a_lidar_get_a_sentence(file, tmp_path):
+    scan, calib = raw(tmp_path)
+    whole = (tmp_path / file).read_bytes()
+
+    @EXAMPLES
+    @given(data=damaged(whole) | st.binary(max_size=64))
+    def check(data):
+        (tmp_path / file).write_bytes(data)
+        is_recoverable(lambda: lidar.read_lidar(scan, [calib], (2, 3)))
+
+    check()

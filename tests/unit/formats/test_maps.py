@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats.maps import read_map_file, read_pfm
 
 RNG = np.random.default_rng(9)
@@ -31,14 +31,14 @@ def test_pfm_of_either_byte_order_has_its_top_row_last_in_the_file(order, scale,
         ("Pf\n8 5\nx\n", 0),
     ],
 )
-def test_what_is_no_whole_grey_pfm_is_refused(head, cut, tmp_path):
+def test_other_pfm_files_are_rejected(head, cut, tmp_path):
     body = FLOATS.tobytes()
     (tmp_path / "m.pfm").write_bytes(head.encode() + body[: len(body) - cut])
-    with pytest.raises(InputError, match=r"map must be a whole grey PFM file"):
+    with pytest.raises(InputError, match=r"map must be a whole (grey PFM|image) file"):
         read_pfm(tmp_path / "m.pfm")
 
 
-def test_pictures_keep_their_type_and_their_values(tmp_path):
+def test_images_keep_their_type_and_their_values(tmp_path):
     for values, suffix in ((WHOLE, "png"), (WHOLE, "tiff"), (FLOATS, "tiff")):
         cv2.imwrite(str(tmp_path / f"m.{suffix}"), values)
         read = read_map_file(tmp_path / f"m.{suffix}")
@@ -119,7 +119,7 @@ def test_an_exr_of_colours_is_a_map_if_they_are_alike_and_unknown_pixels_do_not_
         if is_map:
             np.testing.assert_array_equal(read_map_file(tmp_path / "m.exr"), grey)
         else:
-            with pytest.raises(InputError, match="a map of depths; got .*, a colour picture"):
+            with pytest.raises(InputError, match="a map of depths; got .*, a colour image"):
                 read_map_file(tmp_path / "m.exr")
     exr(tmp_path / "m.exr", {"Z": grey, "R": grey, "G": grey + 1, "B": grey + 2})
     np.testing.assert_array_equal(read_map_file(tmp_path / "m.exr"), grey)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import matlab
 from geodiff_plugin.formats.rigs import CameraChoice
 from tests.unit.formats.calibrated_pair import (
@@ -20,6 +20,7 @@ from tests.unit.formats.calibrated_pair import (
     vector,
     words,
 )
+from tests.views import lenses_of
 
 SKEWS = (3.25, -1.75)
 
@@ -64,11 +65,11 @@ def test_matlab_skew_is_kept_and_two_radial_coefficients_suffice(new):
     rig = read(matlab_text(new, skew=SKEWS, radial=2))
     assert (rig.K_left[0, 1], rig.K_right[0, 1]) == SKEWS
     np.testing.assert_allclose(rig.K_left[:, 2], K_LEFT[:, 2])
-    for lens, expected in zip(rig.distortion, LENSES, strict=True):
+    for lens, expected in zip(lenses_of(rig), LENSES, strict=True):
         np.testing.assert_array_equal(lens.coefficients, [*expected[:4], 0.0])
     bare = read(matlab_text(new, TangentialDistortion="none", ImageSize=None))
     assert bare.size_left is None
-    np.testing.assert_array_equal(bare.distortion[1].coefficients, [*LENS_RIGHT[:2], 0, 0, LENS_RIGHT[4]])
+    np.testing.assert_array_equal(bare.right.lens.coefficients, [*LENS_RIGHT[:2], 0, 0, LENS_RIGHT[4]])
 
 
 def bouguet_text(as_script: bool, turn: str, skew=SKEWS, count: int = 5) -> str:

@@ -1,17 +1,15 @@
-"""Named matrices: names, sides, sizes and units."""
+"""Named matrices: dialects, sides, sizes and units."""
 
 import json
-import re
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError, noted
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import named
-from geodiff_plugin.formats.rigs import CameraChoice, make_rig
+from geodiff_plugin.formats.rigs import CameraChoice
 from tests.unit.formats.calibrated_pair import (
     K_LEFT,
     K_RIGHT,
@@ -26,6 +24,7 @@ from tests.unit.formats.calibrated_pair import (
     numbers,
     vector,
 )
+from tests.views import lenses_of
 
 CAMERAS = {"K1": K_LEFT, "K2": K_RIGHT, "D1": LENS_LEFT[:5], "D2": LENS_RIGHT[:5]}
 POSE = {"R": T[:3, :3], "T": T[:3, 3]}
@@ -39,41 +38,108 @@ def written(entries) -> str:
 
 
 def read(entries, *others, choice=UNCHOSEN):
-    return named.read_opencv(tuple(map(written, (entries, *others))), choice)
+    return named.read_named(tuple(map(written, (entries, *others))), choice)
 
 
 def assert_is_both(rig, size=None, lens=5):
     assert (rig.size_left, rig.size_right) == (size, size)
-    assert_is_the_pair(replace(rig, size_left=None, size_right=None), lens=lens, sizes=False)
+    assert_is_the_pair(rig.sized(None, None), lens=lens, sizes=False)
 
 
-MATRICES = {
-    "M": "m k mtx cam_mtx camera_mat camera.mats camMatrix intr intrinsic intrinsics intrinsic_mtx "
-    "intrinsics-mat intrinsic_matrix",
-    "D": "d dis dist disto distort distortion distortions dist_coef dist_coeff dist_coeffs dist_coefs "
-    "dist_coefficient distortion_coefficients dist_vec distortion_vector dist_params distortion_parameters",
-    "R": "r r_rect rect rectification rect_rot rectification_rotation rect_trans rectification_transform "
-    "rect_mat rectification_matrix",
-    "P": "p proj projection proj_mat proj_mats projection_matrix",
-}
+def values_of(dialect) -> dict:
+    """The matrices of the pair by the fields of a dialect, left and right for those of one camera."""
+    made = rectified()
+    return {
+        "K": (K_LEFT, K_RIGHT),
+        "lens": (LENS_LEFT[:5], LENS_RIGHT[:5]),
+        "projection": (made["P1"], made["P2"]),
+        "rectifying": (made["R1"], made["R2"]),
+        "rotation": vector(T) if dialect.rotation in ("rvec", "om") else T[:3, :3],
+        "translation": T[:3, 3],
+    }
 
 
-@pytest.mark.parametrize(("kind", "words"), MATRICES.items())
-def test_matrix_names_resolve_to_the_camera_they_mention(kind, words):
-    first = named._names(1)
-    for word in words.split():
-        for n, side, number in ((1, "left", "one"), (2, "right", "two")):
-            names = [f"{word}{n}", f"{word}_{side[0]}", f"{word}_{side}", f"{word}_{number}"]
-            names += [f"{word}_cam{n}", f"{word}_camera_{n}", f"{word}_{side}_cam", f"{side}_{word}"]
-            names += [f"{side}_camera_{word}", f"cam{n}_{word}", f"camera_{n}.{word}"]
-            for name in names:
-                squeezed = re.sub("[-_.]", "", name.lower())
-                assert re.fullmatch(first[f"{kind}{n}"], squeezed), name
-                assert not re.fullmatch(first[f"{kind}{3 - n}"], squeezed), name
-                with_zero = re.sub("[12]", lambda digit: str(int(digit[0]) - 1), squeezed)
-                if with_zero != squeezed:
-                    assert re.fullmatch(named._names(0)[f"{kind}{n}"], with_zero), name
-    assert re.fullmatch(named._names(0)[f"{kind}1"], f"{words.split()[0]}zero")
+@pytest.mark.parametrize("dialect", named.DIALECTS, ids=lambda each: each.programs)
+@pytest.mark.parametrize(
+    ("sides", "place"),
+    [
+        *((sides, "behind") for sides in (*named.BEHIND, *named.NUMBERED.values())),
+        *((sides, "in front") for sides in (*named.IN_FRONT, *named.NUMBERED.values())),
+        *((sides, "above") for sides in (*named.IN_FRONT, *named.NUMBERED.values())),
+    ],
+)
+def test_every_name_of_a_dialect_is_read(dialect, sides, place):
+    """Others than its own are those of the documentation."""
+    values, fields = values_of(dialect), dialect._asdict()
+    for field in ("K", "lens", "rotation", "translation", "rectifying", "projection"):
+        for name in fields[field].split():
+            names = {"K": "K", "lens": "D", "rotation": "R", "translation": "T"} | {field: name}
+            cameras, pose = {}, {}
+            for key, value in ((names[each], values[each]) for each in names):
+                if not isinstance(value, tuple):
+                    pose[key] = value
+                    continue
+                for side, number in zip(sides, value, strict=True):
+                    if place == "above":
+                        outer = side if side in ("left", "right") else f"cam{side}"
+                        cameras.setdefault(outer, {})[key] = np.asarray(number).tolist()
+                    else:
+                        cameras[f"{key}_{side}" if place == "behind" else f"{side}.{key}"] = number
+            rig = read(cameras | pose)
+            if field == "projection":
+                assert rig.rectified and rig.as_taken is not None
+            else:
+                assert_is_both(rig)
+
+
+#: Names as public programs and scripts mix them.
+MIXED = [
+    ("mtx_l", "mtx_r", "dist_l", "dist_r", "R", "T"),
+    ("camera_mat_left", "camera_mat_right", "distortion_left", "distortion_right", "rotation_mat", "t_vec"),
+    ("left_camera_matrix", "right_camera_matrix", "left_dist_coeff", "right_dist_coeff", "rotation", "trans"),
+    ("cam_mats_left", "cam_mats_right", "dist_coefs_left", "dist_coefs_right", "rot_mat", "trans_vec"),
+    ("cameraMatrix1", "cameraMatrix2", "distCoeffs1", "distCoeffs2", "stereo_R", "stereo_T"),
+    ("left_intrinsics", "right_intrinsics", "distortion_left", "distortion_right",
+     "rotation_left_to_right", "translation_left_to_right"),
+    ("left_camera_Matrix", "right_camera_Matrix", "left_camera_distCoeffs", "right_camera_distCoeffs",
+     "Rotate_Matrix", "Translate_Matrix"),
+    ("K0", "K1", "D0", "D1", "Rotate", "Trans"),
+    ("camera_matrix_one", "camera_matrix_two", "dist_one", "dist_two", "R", "T"),
+    ("Camera_Matrix_1", "Camera_Matrix_2", "Distortion_Coeffs_1", "Distortion_Coeffs_2", "rotation",
+     "Translation_Vector"),
+    ("KL", "KR", "DL", "DR", "rot", "trans"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("names", MIXED, ids=lambda names: names[0])
+def test_names_that_programs_mix_are_read(names):
+    values = (K_LEFT, K_RIGHT, LENS_LEFT[:5], LENS_RIGHT[:5], T[:3, :3], T[:3, 3])
+    assert_is_both(read(dict(zip(names, values, strict=True))))
+
+
+@pytest.mark.parametrize(
+    "sides", [("left", "right"), ("cam0", "cam1"), ("camera_1", "camera_2"), ("left_cam", "right_cam")]
+)
+def test_cameras_may_be_objects_whose_names_state_the_sides(sides):
+    """Their order in the file means nothing."""
+    left, right = sides
+    cameras = {
+        right: {"camera_matrix": K_RIGHT.tolist(), "distortion": LENS_RIGHT[:5]},
+        left: {"camera_matrix": K_LEFT.tolist(), "distortion": LENS_LEFT[:5]},
+    }
+    stereo = {key: value.tolist() for key, value in POSE.items()}
+    assert_is_both(read(cameras | {"stereo": stereo}))
+
+
+def test_the_matrix_of_undistorted_images_is_not_that_of_the_camera():
+    """As getOptimalNewCameraMatrix gives it, which tutorials save next to the camera's."""
+    cameras = {
+        "mtx_left": K_LEFT,
+        "mtx_right": K_RIGHT,
+        "dist_left": LENS_LEFT[:5],
+        "dist_right": LENS_RIGHT[:5],
+    }
+    assert_is_both(read(cameras | POSE | {"new_mtx_left": K_RIGHT, "new_camera_matrix_right": K_LEFT}))
 
 
 def test_opencv_names_are_read():
@@ -108,9 +174,7 @@ POSES = {
     "R and T": POSE,
     "vectors": {"rvec": vector(T), "tvec": T[:3, 3]},
     "Bouguet's om": {"om": vector(T), "T": T[:3, 3]},
-    "back": {"R_right_to_left": E[:3, :3], "T_right_to_left": E[:3, 3]},
-    "back as a vector": {"rot_2to1": vector(E), "trans_r2l": E[:3, 3]},
-    "forth": {"R_left_to_right": vector(T), "t_1to2": T[:3, 3]},
+    "depthai": {"rotation_left_to_right": T[:3, :3], "translation_left_to_right": T[:3, 3]},
     "a pose": {"E": E},
     "a pose beside the essential matrix": POSE | {"E": np.arange(9.0)},
     "a flat pose": {"pose": E.ravel()},
@@ -118,21 +182,20 @@ POSES = {
 
 
 @pytest.mark.parametrize("pose", POSES.values(), ids=POSES)
-def test_pose_may_be_given_in_either_direction_and_as_a_vector(pose):
+def test_the_pose_may_be_a_matrix_or_a_vector(pose):
     assert_is_both(read(CAMERAS | pose))
 
 
-def test_duplicate_rotations_must_agree():
-    near = np.array(vector(T)) + 5e-5
-    far = np.array(vector(T)) + 3e-4
-    assert_is_both(read(CAMERAS | POSE | {"rvec": near}))
+def test_a_matrix_goes_before_a_rotation_vector():
+    for turn in (vector(T), [0.1, 0.2, 0.3]):
+        assert_is_both(read(CAMERAS | POSE | {"rvec": turn}))
+    assert_is_both(read(CAMERAS | POSE | {"rotation": T[:3, :3].ravel()}))  # the same matrix under two names
     with pytest.raises(
         InputError,
-        match=r"\AR must be there once; got r, rvec, which differ\. Keep those that "
-        r"belong to R and T; files of single cameras have no baseline\.\Z",
+        match=r"\AR must be unique; got r, rotation, which differ\. Keep the ones that match R and T; "
+        r"files of single cameras have no baseline\.\Z",
     ):
-        read(CAMERAS | POSE | {"rvec": far})
-    assert_is_both(read(CAMERAS | POSE | {"rotation": T[:3, :3].ravel()}))  # the same matrix under two names
+        read(CAMERAS | POSE | {"rotation": E[:3, :3]})
 
 
 def rectified(size=SIZE_LEFT):
@@ -165,7 +228,7 @@ def test_projections_of_unrectified_images_are_ignored(name, at):
     projections = {"P1": K_LEFT @ np.eye(3, 4), "P2": K_RIGHT @ T[:3]}
     projections["P2"][:, :3] = K_RIGHT
     assert read(CAMERAS | POSE | projections).rectified
-    assert read(projections | {"M": K_LEFT}).rectified
+    assert read(projections | {"K": K_LEFT}).rectified
     projections[name] = projections[name].copy()
     projections[name][at] = 1.0 if at[0] == at[1] else 1e-3
     assert_is_both(read(CAMERAS | POSE | projections))
@@ -175,9 +238,6 @@ def test_projections_use_the_image_size_and_unit_of_the_file():
     P2 = K_LEFT @ np.column_stack([np.eye(3), [-173.0, 0, 0]])
     entries = {"P1": K_LEFT @ np.eye(3, 4), "P2": P2, "image_size": SIZE_LEFT}
     assert_is_parallel(read(entries | {"unit": "mm"}), sizes=(SIZE_LEFT, SIZE_LEFT))
-    assert_is_parallel(
-        read(entries | {"baseline_m": 0.173}), baseline=173.0, sizes=(SIZE_LEFT, SIZE_LEFT)
-    ) if False else None
     assert read(entries | {"baseline_cm": 17.3}).E[0, 3] == pytest.approx(0.173)
 
 
@@ -205,7 +265,7 @@ def test_ambiguous_sizes_are_kept_as_written():
     K = np.array([[800.0, 0, 359.0], [0, 800, 359], [0, 0, 1]])
     entries = {"K1": K, "K2": K, "image_size": (616, 820)} | POSE
     assert read(entries, choice=CameraChoice(image_size=(820, 616))).size_left == (616, 820)
-    single = {"M": K_LEFT, "image_size": (616, 820), "baseline": 0.173}
+    single = {"K": K_LEFT, "image_size": (616, 820), "baseline": 0.173}
     assert read(single, choice=CameraChoice(image_size=(820, 616))).size_left == (820, 616)
 
 
@@ -216,8 +276,6 @@ UNITS = {"mm": 1e3, "millimetres": 1e3, "cm": 1e2, "centimeter": 1e2, "m": 1.0, 
 def test_unit_suffixes_of_names_are_applied(unit, factor):
     rotation = {"R": T[:3, :3]}
     assert_is_both(read(CAMERAS | rotation | {f"translation_{unit}": factor * T[:3, 3]}))
-    back = {"R_r2l": E[:3, :3], f"T_r2l_{unit}": factor * E[:3, 3]}
-    assert_is_both(read(CAMERAS | back))
     for name in ("unit", "units", "length_unit", "world_units"):
         assert_is_both(read(CAMERAS | rotation | {"T": factor * T[:3, 3], name: unit.upper()}))
     parallel = {"K1": K_LEFT, "K2": K_RIGHT, f"baseline_{unit}": 0.173 * factor}
@@ -226,79 +284,10 @@ def test_unit_suffixes_of_names_are_applied(unit, factor):
     assert_is_parallel(read(both), K_LEFT, K_RIGHT, rectified=False)
 
 
-@pytest.mark.parametrize(
-    ("length", "baseline", "stated", "unit"),
-    [
-        (173.0, 0.173, None, 1e3),
-        (173.0, 0.177, None, 1e3),
-        (173.0, 0.179, None, None),
-        (173.0, 0.169, None, 1e3),
-        (173.0, 0.167, None, None),
-        (17.3, 0.173, None, 1e2),
-        (0.173, 0.173, None, None),
-        (0.173, 173.0, 1e3, 1.0),
-        (17.3, 173.0, 1e3, 1e2),
-        (173.0, 173.0, 1e3, 1e3),
-        (173.0, 17.3, 1e2, 1e3),
-        (5.0, 173.0, 1e3, None),
-    ],
-)
-def test_translation_unit_is_inferred_from_the_baseline(length, baseline, stated, unit):
-    assert named._unit_by_baseline(length, baseline, stated) == unit
-
-
-@pytest.mark.parametrize(
-    ("square", "metres", "is_known"),
-    [
-        ("square_size_mm", 0.021, True),
-        ("square_size_mm", 0.019, False),
-        ("square_size_mm", 4.9, True),
-        ("square_size_mm", 5.1, False),
-        ("pattern_spacing_cm", 0.3, True),
-        ("tag_size_m", 0.3, True),
-        ("marker_length_mm", 0.3, True),
-    ],
-)
-def test_board_unit_applies_only_if_the_baseline_is_plausible(square, metres, is_known):
-    units = named.UNITS[square.rpartition("_")[2]]
-    entries = {square: np.array([24.5]), "t": np.zeros(3)}
-    assert named._units_a_metre(entries, metres * units) == (units if is_known else None)
-    assert named._units_a_metre({"square_size": np.array([24.5])}, metres) is None
-    assert named._units_a_metre(entries | {"square_size_mm": np.array([1.0, 2.0])}, metres * units) == (
-        units if is_known and square != "square_size_mm" else None
-    )
-
-
-def test_unit_hints_have_a_fixed_precedence():
-    entries = {"unit": "mm", "baseline_cm": np.array([17.3]), "square_size_mm": np.array([24.5])}
-    assert named._units_a_metre({"t_cm": np.zeros(3)} | entries, 0.173) == 1e2
-    assert named._units_a_metre(entries, 0.173) == 1e3
-    del entries["unit"]
-    assert named._units_a_metre(entries, 0.173) == 1.0
-    assert named._units_a_metre(entries, 999.0) == 1e3
-    assert named._units_a_metre({"unit": "furlong"}, 1.0) is None
-
-
-@pytest.mark.parametrize(
-    ("metres", "given", "warns"),
-    [(1.49, None, False), (1.51, None, True), (19.9, None, True), (20.1, None, False), (1.51, 1.5, False)],
-)
-def test_long_baselines_without_a_unit_raise_a_warning(metres, given, warns):
-    cameras = make_rig(named.Camera(K_LEFT), named.Camera(K_RIGHT), E * [[1], [1], [1], [1]])
-    cameras.E[:3, 3] *= metres / LENGTH
-    with noted() as reported, pytest.warns() if warns else noted():
-        rig = named.in_stated_unit(cameras, {}, CameraChoice(baseline_m=given))
-    np.testing.assert_array_equal(rig.E, cameras.E)
-    assert [each.code for each in reported] == ["calibration.assumed-metres"] * warns
-    assert not warns or f"and {metres:.4g} m is long for two cameras" in reported[0]
-    with noted() as reported:
-        named.in_stated_unit(cameras, {"unit": "m"}, CameraChoice())
-    assert not reported
-
-
-def test_distortion_under_unknown_names_is_refused():
+def test_distortion_under_unknown_names_is_rejected():
     sentence = (
-        r"\Athe lens distortion must be of both cameras \(D1, D2\); got {}\. Rename what is lens .* zeros\.\Z"
+        r"\Athe lens distortion must be given for both cameras \(D1, D2\); got {}\. "
+        r"Rename lens .* differently\.\Z"
     )
     entries = CAMERAS | POSE
     for change, got in (
@@ -308,8 +297,8 @@ def test_distortion_under_unknown_names_is_refused():
     ):
         with pytest.raises(InputError, match=sentence.format(got)):
             read(entries | change)
-    assert read(entries | {"D2": None, "D1": [0, 0, 0, 0]}).distortion == (None, None)
-    assert read(entries | {"D1": None, "D2": None, "distance": 3}).distortion == (None, None)
+    assert lenses_of(read(entries | {"D2": None, "D1": [0, 0, 0, 0]})) == (None, None)
+    assert lenses_of(read(entries | {"D1": None, "D2": None, "distance": 3})) == (None, None)
     assert_is_both(read(entries | {"undistorted": [1, 2]}))
 
 
@@ -334,8 +323,8 @@ def test_cameras_may_come_in_separate_files():
     for files in ((left, right), (left, right, left)):
         with pytest.raises(
             InputError,
-            match=r"\Athe file must be a calibration with P1, P2, or with M1, M2, R, T; "
-            r"got no M1, M2, R, T among .*\. It is of one camera: .*\Z",
+            match=r"\Athe file must be a calibration with P1, P2, or with K1, K2, R, T; "
+            r"got no K1, K2, R, T among .*\. It has a single camera\. Pass .*\Z",
         ):
             read(*files)
 
@@ -343,42 +332,45 @@ def test_cameras_may_come_in_separate_files():
 def test_one_matrix_and_lens_may_apply_to_both_cameras():
     shared = {"K": K_LEFT, "D": LENS_LEFT[:5], "baseline": 0.173, "image_size": SIZE_LEFT}
     rig = read(shared)
-    assert [lens.coefficients.tolist() for lens in rig.distortion] == [LENS_LEFT[:5]] * 2
+    assert [lens.coefficients.tolist() for lens in lenses_of(rig)] == [LENS_LEFT[:5]] * 2
     np.testing.assert_array_equal(rig.K_right, K_LEFT)
     assert rig.size_left == rig.size_right == SIZE_LEFT and rig.E[0, 3] == 0.173
     each = read({**shared, "D": None, "D1": LENS_LEFT[:5], "D2": LENS_RIGHT[:5]})
-    assert [lens.coefficients.tolist() for lens in each.distortion] == [LENS_LEFT[:5], LENS_RIGHT[:5]]
+    assert [lens.coefficients.tolist() for lens in lenses_of(each)] == [LENS_LEFT[:5], LENS_RIGHT[:5]]
     both = read({"K1": K_LEFT, "K2": K_RIGHT, "D1": LENS_LEFT, "D2": LENS_RIGHT, "baseline": 0.173})
     np.testing.assert_array_equal(both.K_right, K_RIGHT)
-    assert [lens.coefficients.tolist() for lens in both.distortion] == [LENS_LEFT, LENS_RIGHT]
-    assert read({"K": K_LEFT, "baseline": 0.173}).distortion == (None, None)
+    assert [lens.coefficients.tolist() for lens in lenses_of(both)] == [LENS_LEFT, LENS_RIGHT]
+    assert lenses_of(read({"K": K_LEFT, "baseline": 0.173})) == (None, None)
     mixed = read({"K": K_LEFT, "K2": K_RIGHT, "baseline": 0.173})
     np.testing.assert_array_equal(mixed.K_left, K_LEFT)
     np.testing.assert_array_equal(mixed.K_right, K_RIGHT)
     with pytest.raises(
         InputError,
         match=r"\Athe file must be a calibration with K1 and K2, or K, and a baseline; "
-        r"got no K1, K2\. It has a baseline, but no camera: .*\Z",
+        r"got no K1, K2\. It has a baseline but no cameras; pass .*\Z",
     ):
         read({"baseline": 0.173, "image_size": SIZE_LEFT})
 
 
 @pytest.mark.parametrize(
-    ("entries", "got", "cure"),
+    ("entries", "got", "hint"),
     [
-        ({"K1": K_LEFT} | POSE, r"no M2 among k1 \(9\), r \(9\), t \(3\)", "Where intrinsics and .*--E"),
-        (POSE, r"no M1, M2 among r \(9\), t \(3\)", "Where intrinsics and "),
-        (CAMERAS, r"no R, T among k1 \(9\), k2 \(9\), d1 \(5\), d2 \(5\)", "Where intrinsics and "),
-        (CAMERAS | {"T": T[:3, 3]}, r"no R among .*", "Where intrinsics and "),
-        ({"E": E}, r"no M1, M2 among e \(16\)", "Where intrinsics and "),
-        ({"R_r2l": E[:3, :3], "T_r2l": E[:3, 3]}, r"no M1, M2 among .*", "Where intrinsics and "),
-        ({"K": K_LEFT}, r"no M1, M2, R, T among k \(9\)", "It is of one camera: give the stereo "),
-        ({"note": "nothing"}, "no M1, M2, R, T", "Where intrinsics and "),
-        ({f"a{n}": [0] * 9 for n in range(10)}, r"no M1, M2, R, T among a0 \(9\), .*, a7 \(9\)", "Where "),
+        (
+            {"K1": K_LEFT} | POSE,
+            r"no K2 among k1 \(9\), r \(9\), t \(3\)",
+            "If intrinsics and .*docs/reference/calibration.md.*--E",
+        ),
+        (POSE, r"no K1, K2 among r \(9\), t \(3\)", "If intrinsics and "),
+        (CAMERAS, r"no R, T among k1 \(9\), k2 \(9\), d1 \(5\), d2 \(5\)", "If intrinsics and "),
+        (CAMERAS | {"T": T[:3, 3]}, r"no R among .*", "If intrinsics and "),
+        ({"E": E}, r"no K1, K2 among e \(16\)", "If intrinsics and "),
+        ({"K": K_LEFT}, r"no K1, K2, R, T among k \(9\)", "It has a single camera. Pass the stereo "),
+        ({"finding": "nothing"}, "no K1, K2, R, T", "If intrinsics and "),
+        ({f"a{n}": [0] * 9 for n in range(10)}, r"no K1, K2, R, T among a0 \(9\), .*, a7 \(9\)", "If "),
     ],
 )
-def test_errors_for_missing_matrices_list_the_available_ones(entries, got, cure):
-    sentence = rf"\Athe file must be a calibration with P1, P2, or with M1, M2, R, T; got {got}\. {cure}"
+def test_errors_for_missing_matrices_list_the_available_ones(entries, got, hint):
+    sentence = rf"\Athe file must be a calibration with P1, P2, or with K1, K2, R, T; got {got}\. {hint}"
     with pytest.raises(InputError, match=sentence):
         read(entries)
 
@@ -387,13 +379,13 @@ def test_conflicting_single_camera_entries_are_ignored():
     assert_is_both(read(CAMERAS | POSE | {"camera_matrix": K_LEFT, "mtx": K_RIGHT}))
     assert_is_both(read(CAMERAS | POSE | {"size": SIZE_LEFT, "resolution": [3, 4]}))
     assert_is_both(read(CAMERAS | POSE | {"width": 5, "image_width": 6, "height": 4}))
-    with pytest.raises(InputError, match="M1 must be there once; got k1, camera_matrix_1, which differ"):
+    with pytest.raises(InputError, match="K1 must be unique; got k1, camera_matrix_1, which differ"):
         read(CAMERAS | POSE | {"camera_matrix_1": K_RIGHT})
 
 
 def test_four_numbers_are_read_as_fx_fy_cx_cy():
     assert_is_both(read(CAMERAS | POSE | {"K1": numbers(K_LEFT), "K2": numbers(K_RIGHT)}))
-    with pytest.raises(InputError, match=r"\AM2 must be 9 finite numbers; got 5\. Check"):
+    with pytest.raises(InputError, match=r"\AK2 must be 9 finite numbers; got 5\. Check"):
         read(CAMERAS | POSE | {"K2": [1, 2, 3, 4, 5]})
 
 

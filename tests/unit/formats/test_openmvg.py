@@ -206,8 +206,11 @@ def test_alicevision_lenses_have_old_and_new_names(scan, changes, model, count):
         ({"type": "equidistant", "distortionType": "none"}, "; got none. Run: aliceVision_exportColmap."),
         ({"distortionType": "3deradial4"}, "; got 3deradial4. Run: aliceVision_exportColmap."),
         ({"undistortionType": "3deanamorphic4"}, "; got 3deanamorphic4. Run: aliceVision_exportColmap."),
-        ({"width": "61", "height": "62"}, "for its focal length to be known; got 61x62. Run: aliceVision"),
-        ({"focalLength": None}, "its entries do not read (KeyError: 'focalLength')"),
+        (
+            {"width": "61", "height": "62"},
+            "a landscape image, whose focal length is unambiguous; got 61x62. Run: aliceVision",
+        ),
+        ({"focalLength": None}, "its entries cannot be read (KeyError: 'focalLength')"),
     ],
 )
 def test_unsupported_alicevision_cameras_exclude_their_images(scan, changes, problem):

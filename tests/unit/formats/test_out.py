@@ -4,12 +4,14 @@ import json
 import os
 import shutil
 import threading
+from contextlib import nullcontext
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError, InputFileError, MissingFileError
-from geodiff_plugin.formats import out
+from geodiff_plugin._internal.checks import InputError, InputFileError, MissingFileError
+from geodiff_plugin.formats import Cloud, out, write_colmap, write_depth_npy, write_pfm, write_ply
 from geodiff_plugin.formats.out import (
     FOLDER_LOCK,
     PARTIAL,
@@ -21,10 +23,11 @@ from geodiff_plugin.formats.out import (
     files_of_report,
     free_folder,
     lock_file,
+    locked_folder,
     reason_of,
-    working_in,
     write_text,
 )
+from tests.unit.error_sentences import check_error
 
 
 def names(folder) -> list[str]:
@@ -45,7 +48,7 @@ def test_a_temporary_path_has_the_name_and_the_suffix_and_is_another_one_each_ti
     ):
         pass
     with (
-        pytest.raises(MissingFileError, match=r"in an existing folder; .*Make the folder .*none first"),
+        pytest.raises(MissingFileError, match=r"in an existing folder; .*Create the folder .*none first"),
         atomic_path(tmp_path / "none" / "a"),
     ):
         pass
@@ -76,7 +79,9 @@ def test_an_output_folder_is_new_or_empty_unless_it_may_be_overwritten(tmp_path)
             (target / left).touch()
         assert check_new(tmp_path / "link", False) == target, "what an unfinished run left does not count"
     (target / "depth.npy").touch()
-    with pytest.raises(InputError, match="a new or empty folder; got .*link, which holds files.*--overwrite"):
+    with pytest.raises(
+        InputError, match="a new or empty folder; got .*link, which contains files.*--overwrite"
+    ):
         check_new(tmp_path / "link", False)
     assert check_new(target, True) == target
     (tmp_path / "file").touch()
@@ -85,7 +90,7 @@ def test_an_output_folder_is_new_or_empty_unless_it_may_be_overwritten(tmp_path)
             check_new(tmp_path / "file", overwrite)
     (tmp_path / "loop").symlink_to("loop")
     for path in (tmp_path / "loop", tmp_path / "loop" / "a", tmp_path / "file" / "a", tmp_path / ("n" * 250)):
-        with pytest.raises(InputError, match=r"--out must be a folder that can be written to; got .*\(.*\)"):
+        with pytest.raises(InputError, match=r"--out must be a writable folder; got .*\(.*\)"):
             check_out(path)
     assert check_out(tmp_path / ("n" * 200)).name == "n" * 200
 
@@ -122,26 +127,28 @@ def raising(error):
 
 
 def test_a_folder_is_worked_in_alone_or_shared_and_its_lock_goes_with_the_last(tmp_path):
-    with working_in(tmp_path):
+    with locked_folder(tmp_path):
         assert names(tmp_path) == [FOLDER_LOCK]
         for shared in (True, False):
             with (
-                pytest.raises(InputError, match="a folder that no other run has; got .*one is working in"),
-                working_in(tmp_path, shared=shared),
+                pytest.raises(
+                    InputError, match="a folder that no other run uses; got .*another run is using"
+                ),
+                locked_folder(tmp_path, shared=shared),
             ):
                 pass
         assert names(tmp_path) == [FOLDER_LOCK], "who was refused removes nothing"
     assert names(tmp_path) == []
-    with working_in(tmp_path, shared=True):
+    with locked_folder(tmp_path, shared=True):
         with (
-            working_in(tmp_path, shared=True),
+            locked_folder(tmp_path, shared=True),
             pytest.raises(InputError, match="no other run"),
-            working_in(tmp_path),
+            locked_folder(tmp_path),
         ):
             pass
         assert names(tmp_path) == [FOLDER_LOCK], "the other one still works"
     assert names(tmp_path) == []
-    with pytest.raises(InputError, match="can be written to"), working_in(tmp_path / "none"):
+    with pytest.raises(InputError, match="a writable folder"), locked_folder(tmp_path / "none"):
         pass
 
 
@@ -155,9 +162,9 @@ def test_a_lock_that_its_holder_removed_meanwhile_is_taken_again(tmp_path, monke
         return real(file, shared)
 
     monkeypatch.setattr(out, "lock_file", lock)
-    with working_in(tmp_path):
+    with locked_folder(tmp_path):
         assert len(taken) == 2 and names(tmp_path) == [FOLDER_LOCK]
-        with pytest.raises(InputError, match="no other run"), working_in(tmp_path):
+        with pytest.raises(InputError, match="no other run"), locked_folder(tmp_path):
             pass
     assert names(tmp_path) == []
 
@@ -202,14 +209,14 @@ def test_an_output_folder_is_made_with_those_above_it_and_may_be_written_twice(e
     assert names(path) == ["a.npy", "report.json"] and names(path.parent) == ["out"]
     with pytest.raises(TypeError):
         OutFolder(tmp_path / "c", [])  # settings are given by name
-    with pytest.raises(TypeError), working_in(tmp_path, True):
+    with pytest.raises(TypeError), locked_folder(tmp_path, True):
         pass
     with OutFolder(tmp_path / "c" / "d"):
         assert (tmp_path / "c").is_dir()
     assert names(tmp_path) == ["a"], "a run without a result leaves no folder"
 
 
-def test_an_output_folder_with_an_input_in_it_is_refused(tmp_path):
+def test_an_output_folder_with_an_input_in_it_is_rejected(tmp_path):
     folder = tmp_path / "out"
     (folder / "deep").mkdir(parents=True)
     (folder / "left.png").touch()
@@ -217,7 +224,7 @@ def test_an_output_folder_with_an_input_in_it_is_refused(tmp_path):
     (tmp_path / "link.png").symlink_to(folder / "left.png")
     for inputs in ([folder / "left.png"], [tmp_path / "none.png", tmp_path / "link.png"]):
         with (
-            pytest.raises(InputError, match="a folder that holds no input of the run; got .*, which holds"),
+            pytest.raises(InputError, match="a folder without inputs of the run; got .*, which holds"),
             OutFolder(folder, inputs=inputs, overwrite=True),
         ):
             pass
@@ -293,3 +300,106 @@ def test_another_thread_finds_the_folder_taken_until_it_is_given_back(tmp_path):
     assert len(said) == 1 and "which another process is writing to" in said[0]
     run()
     assert len(said) == 1 and names(tmp_path / "out") == ["a.npy", "report.json"]
+
+
+def entered(manager):
+    with manager:
+        return
+
+
+@pytest.mark.parametrize(
+    ("call", "parts"),
+    [
+        (
+            lambda p: entered(atomic_path(p / "taken")),
+            ("The output", "a file", "the folder {}/taken", "Pass a file"),
+        ),
+        (
+            lambda p: entered(atomic_path(p / "none" / "a")),
+            ("The output", "in an existing folder", "{}/none/a", "Create the folder {}/none first"),
+        ),
+        (
+            lambda p: out.raise_unwritable(p, OSError(28, "No space left")),
+            ("--out", "a writable folder", "{} (No space left)", "free disk space"),
+        ),
+        (lambda p: check_out(p / "file"), ("--out", "a folder", "the file {}/file", "Pass a folder")),
+        (
+            lambda p: check_new(p / "taken", False),
+            ("--out", "a new or empty folder", "{}/taken, which contains files", "--overwrite"),
+        ),
+        (
+            lambda p: check_new_file(p / "file", False),
+            ("--out", "a new file", "{}/file, which exists", "--overwrite"),
+        ),
+        (
+            lambda p: entered(locked_folder(p / "held")),
+            (
+                "--out",
+                "a folder that no other run uses",
+                "{}/held, which another run is using",
+                "Wait for it",
+            ),
+        ),
+        (
+            lambda p: entered(OutFolder(p / "taken", inputs=[p / "taken" / "a"], overwrite=True)),
+            (
+                "--out",
+                "a folder without inputs of the run",
+                "{0}/taken, which holds {0}/taken/a",
+                "another",
+            ),
+        ),
+        (
+            lambda p: entered(OutFolder(p / "written")),
+            (
+                "--out",
+                "a folder that no other run uses",
+                "{}/written, which another process is writing",
+                "Wait",
+            ),
+        ),
+    ],
+)
+def test_errors_state_what_was_expected_and_what_was_found(tmp_path, call, parts):
+    for name in ("taken", "held"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "taken" / "a").touch()
+    (tmp_path / "file").touch()
+    with locked_folder(tmp_path / "held"), OutFolder(tmp_path / "written"):
+        check_error(lambda: call(tmp_path), *(part.format(tmp_path) for part in parts))
+
+
+@pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt])
+def test_atomic_path_appears_whole_as_a_plain_file_or_leaves_the_old_one(tmp_path, error):
+    (tmp_path / "a.png").write_text("old")
+    mode = (tmp_path / "a.png").stat().st_mode
+    with pytest.raises(error) if error else nullcontext(), atomic_path(tmp_path / "a.png") as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".png"
+        temporary.write_text("new")
+        assert (tmp_path / "a.png").read_text() == "old"
+        if error is not None:
+            raise error
+    assert names(tmp_path) == ["a.png"] and (tmp_path / "a.png").stat().st_mode == mode
+    assert (tmp_path / "a.png").read_text() == ("new" if error is None else "old")
+
+
+EMPTY = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (lambda f: write_pfm(f / "a.pfm", np.zeros(3)), "shape"),
+        (lambda f: write_ply(f / "d.ply", np.ones((3, 4)), np.zeros((4, 3, 3)), np.eye(3)), "image_01"),
+        (lambda f: write_ply(f / "d.ply", np.ones((3, 4)), np.zeros((3, 4, 3)), np.zeros((3, 3))), "focal"),
+        (lambda f: write_depth_npy(f, np.zeros((2, 3))), "folder"),
+        (
+            lambda f: write_colmap(f, [("my left.png", np.eye(3), np.eye(4), (64, 48))], EMPTY),
+            "without blanks",
+        ),
+    ],
+)
+def test_what_cannot_be_written_leaves_nothing(tmp_path, write, said):
+    with pytest.raises(ValueError, match=said):
+        write(tmp_path)
+    assert names(tmp_path) == []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats.pcd import read_pcd_points
 
 RNG = np.random.default_rng(6)
@@ -72,7 +72,7 @@ def test_x_y_and_z_are_found_among_the_columns_and_unknown_points_left_out(how, 
     kept = np.delete(points, [4, 9], axis=0)
     np.testing.assert_array_equal(read_pcd_points(path), kept)
     path.write_bytes(head(how, 41) + body(rows, how))
-    with pytest.raises(InputError, match="points must be a (whole PCD file|PCD file with the 41 points)"):
+    with pytest.raises(InputError, match="points must be a (whole PCD file|PCD file with 41 points)"):
         read_pcd_points(path)
     path.write_bytes(head(how, 40).replace(b" z ", b" w ") + body(rows, how))
     with pytest.raises(InputError, match="a whole PCD file with x, y and z"):
@@ -136,7 +136,7 @@ def test_copies_of_every_length_and_distance_repeat_what_came_before(steps, tmp_
         ([literal(b"abcdef"), literal(b"ghi")], 6),
     ],
 )
-def test_damaged_copies_are_refused(runs, size, tmp_path):
+def test_damaged_copies_are_rejected(runs, size, tmp_path):
     (tmp_path / "c.pcd").write_bytes(packed_points(runs, bytes(size)))
     with pytest.raises(InputError, match="a whole PCD file"):
         read_pcd_points(tmp_path / "c.pcd")

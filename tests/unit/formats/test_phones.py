@@ -42,11 +42,13 @@ def test_polycam_prefers_corrected_cameras(tmp_path, below, corrected):
         files = write_images(folder / "corrected_images", NAMES)
         write_polycam(folder / "corrected_cameras")
     depths = [folder / "depth" / name for name in NAMES]
-    assert_is_read(phones.read_polycam(tmp_path), "Polycam", "m", files, depths=depths)
+    assert_is_read(phones.POLYCAM(tmp_path), "Polycam", "m", files, depths=depths)
     (files[1].parent.parent / ("corrected_cameras" if corrected else "cameras") / "11.json").write_text("{}")
-    candidates = phones.read_polycam(tmp_path).candidates
-    assert candidates[1].problem == "its entries do not read (KeyError: 't_00')" and not candidates[2].problem
-    assert phones.read_polycam(tmp_path / "nowhere") is None
+    candidates = phones.POLYCAM(tmp_path).candidates
+    assert (
+        candidates[1].problem == "its entries cannot be read (KeyError: 't_00')" and not candidates[2].problem
+    )
+    assert phones.POLYCAM(tmp_path / "nowhere") is None
 
 
 @pytest.mark.parametrize("below", ["", "EXR_RGBD"])
@@ -106,7 +108,7 @@ def test_stray_scanner_rows_are_video_frames(tmp_path):
         names=["000000", "000003", "000001"],
     )
     assert [each.frame.index for each in layout.candidates] == [0, 3, 1]
-    assert [each.frame.size for each in layout.candidates] == [(64, 48)] * 3
+    assert [each.camera.size for each in layout.candidates] == [(64, 48)] * 3
     (tmp_path / "depth" / "000003.npy").unlink()
     assert phones.read_stray(tmp_path).candidates[1].frame.depth is None
     for name in ("rgb.mp4", "odometry.csv"):
@@ -118,7 +120,7 @@ def test_stray_scanner_rows_are_video_frames(tmp_path):
 @pytest.mark.parametrize("by_columns", [False, True])
 def test_scanner_app_matrices_may_be_row_or_column_major(tmp_path, by_columns):
     files = write_images(tmp_path, ["frame_00010.png", "frame_00011.png", "frame_frame.png"])
-    write_images(tmp_path, ["frame_alone.png", "other.png"])
+    write_images(tmp_path, ["other.png"])
     (tmp_path / "other.json").write_text("{}")
     for n, file in enumerate(files):
         E, K = POSES[n] @ FLIP, KS[n] + CORNER
@@ -126,13 +128,13 @@ def test_scanner_app_matrices_may_be_row_or_column_major(tmp_path, by_columns):
         entries = {"cameraPoseARFrame": E.ravel().tolist(), "intrinsics": K.ravel().tolist()}
         file.with_suffix(".json").write_text(json.dumps(entries))
     depths = [tmp_path / name for name in ("depth_00010.png", "depth_00011.png", "depth_frame.png")]
-    layout = phones.read_scanner_app(tmp_path)
+    layout = phones.SCANNER_APP(tmp_path)
     assert_is_read(layout, "3D Scanner App", "m", files, sizes=None, depths=depths)
     files[0].with_suffix(".json").write_text("{}")
-    assert phones.read_scanner_app(tmp_path) is None
+    assert phones.SCANNER_APP(tmp_path) is None
     for file in files:
         file.with_suffix(".json").unlink()
-    assert phones.read_scanner_app(tmp_path) is None
+    assert phones.SCANNER_APP(tmp_path) is None
 
 
 @pytest.mark.parametrize("below", [True, False])

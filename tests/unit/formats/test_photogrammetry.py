@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import photogrammetry
 from tests.unit.formats.calibrated_pair import quaternion, vector, words
 from tests.unit.formats.posed_images import (
@@ -115,10 +115,12 @@ def test_metashape_part_with_most_placed_cameras_is_read(tmp_path):
     mixed = f'{two}{camera(2, component="")}<camera sensor_id="s0"/>'  # without label or component
     one = "".join(camera(n, component='component_id="0"', label=f"y{n}", placed=n == 0) for n in (0, 1, 2))
     layout = metashape(tmp_path, few + chunk(one + mixed))
-    assert_is_read(layout, "Metashape", None, files, Ks=expected_Ks(), lenses=LENSES, notes=["capture.part"])
-    reported = layout.notes[0]
-    assert "largest chunk or component, of 3 images" in reported and reported.endswith(
-        "those of 2, 1 images."
+    assert_is_read(
+        layout, "Metashape", None, files, Ks=expected_Ks(), lenses=LENSES, findings=["capture.part"]
+    )
+    reported = layout.findings[0]
+    assert "largest chunk or component, with 3 images" in reported and reported.endswith(
+        "Others (with 2, 1 images) are ignored, as each has a separate coordinate frame."
     )
 
 
@@ -223,8 +225,13 @@ def test_opensfm_cameras_are_normalized_by_the_longer_side(tmp_path, kind):
     layout = photogrammetry.read_opensfm(tmp_path)
     model, names = OPENSFM[kind or "perspective"]
     lenses = [[opensfm_camera(n, kind).get(name, 0.0) for name in names] for n in range(3)]
-    assert_is_read(layout, "OpenSfM", None, files, lenses=lenses, models=[model] * 3, notes=["capture.part"])
-    assert "largest part, of 3 images" in layout.notes[0] and "those of 2, 1 images" in layout.notes[0]
+    assert_is_read(
+        layout, "OpenSfM", None, files, lenses=lenses, models=[model] * 3, findings=["capture.part"]
+    )
+    assert (
+        "largest part, with 3 images" in layout.findings[0]
+        and "Others (with 2, 1 images)" in layout.findings[0]
+    )
 
 
 def test_opensfm_may_have_a_single_focal_length(tmp_path):
@@ -237,7 +244,7 @@ def test_opensfm_may_have_a_single_focal_length(tmp_path):
     (tmp_path / "opensfm" / "reconstruction.json").write_text(json.dumps([part]))
     (tmp_path / "opensfm" / "reference_lla.json").write_text("{}")
     layout = photogrammetry.read_opensfm(tmp_path)
-    assert layout.notes[0].code == "capture.gps-scale" and len(layout.notes) == 1
+    assert layout.findings[0].code == "capture.gps-scale" and len(layout.findings) == 1
     expected = [central(n, KS[n][0, 0]) for n in range(3)]
     for each, file, K in zip(layout.candidates, files, expected, strict=True):
         assert each.frame.image == file
@@ -258,7 +265,7 @@ def test_opensfm_rejects_other_files_and_excludes_unknown_lenses(tmp_path):
     (tmp_path / "2_reconstruction.json").write_text("[]")
     with pytest.raises(
         InputError,
-        match=r"\Areconstruction\.json must be with images that were placed; got .*"
+        match=r"\Areconstruction\.json must be with aligned images; got .*"
         r"2_reconstruction\.json with none\.",
     ):
         photogrammetry.read_opensfm(tmp_path)
@@ -326,7 +333,7 @@ def test_unregistered_bundler_images_have_no_camera_and_counts_must_match(tmp_pa
     with pytest.raises(
         InputError,
         match=r"\APATH must be b\.out with its list of images \(list\.txt, pictures\.txt\); "
-        r"got .*b\.out without\. Bundler numbers its images: put ",
+        r"got .*b\.out without\. Bundler refers to images by number\. Put its ",
     ):
         photogrammetry.read_bundler(tmp_path)
     (tmp_path / "list.txt").write_text("a.png\nb.png\nc.png\n")
@@ -334,7 +341,7 @@ def test_unregistered_bundler_images_have_no_camera_and_counts_must_match(tmp_pa
     assert candidates[1].camera is None and candidates[1].frame.E is None and not candidates[1].problem
     np.testing.assert_allclose(candidates[2].frame.E, POSES[2], atol=1e-9)
     (tmp_path / "list.txt").write_text("a.png\nb.png\n")
-    with pytest.raises(InputError, match=r"\Alist\.txt must be of the 3 images of b\.out; got 2\.\Z"):
+    with pytest.raises(InputError, match=r"\Alist\.txt must be a list of the 3 images in b\.out; got 2\.\Z"):
         photogrammetry.read_bundler(tmp_path)
     (tmp_path / "b.out").write_text("x")
     assert photogrammetry.read_bundler(tmp_path) is None

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import points as module
 from geodiff_plugin.formats import read_points
 
@@ -48,19 +48,19 @@ def test_text_columns_follow_the_heading(tmp_path, heading, order):
     [
         (
             "a b z\n1 2 3\n",
-            r"\Aknown must be points with columns x, y and z, in metres; got .*p\.txt with a, b, z\. Write",
+            r"\Aknown must be points with columns x, y and z, in metres; got .*p\.txt with a, b, z\. Save",
         ),
-        ("x x z\n1 2 3\n", r"with x, x, z\. Write the points"),
+        ("x x z\n1 2 3\n", r"with x, x, z\. Save points"),
         (
             "1 2 3\n1 2\n",
-            r"\Aknown must be points in metres, one a line, below one heading at most; got "
+            r"\Aknown must be points in metres, one per line, with at most one heading; got "
             r".*p\.txt with words, "
             r"or rows of \[2, 3\] numbers\.",
         ),
         ("x y z\nq y z\n1 2 3\n", r"with words, or rows of \[3\] numbers\."),
     ],
 )
-def test_malformed_text_is_refused(tmp_path, content, words):
+def test_malformed_text_is_rejected(tmp_path, content, words):
     (tmp_path / "p.txt").write_text(content)
     with pytest.raises(InputError, match=words):
         read_points(tmp_path / "p.txt", "known")
@@ -79,7 +79,7 @@ def test_arrays_of_three_four_or_six_columns_are_points(tmp_path, columns):
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 3, 3), (0, 3), (3, 0)])
-def test_arrays_of_other_shapes_are_refused(tmp_path, shape):
+def test_arrays_of_other_shapes_are_rejected(tmp_path, shape):
     np.save(tmp_path / "p.npy", np.ones(shape))
     with pytest.raises(
         InputError, match=r"\Aknown must be a map \(H, W\) or points \(N, 3\) of numbers; got .* of shape"
@@ -125,7 +125,7 @@ def test_integer_images_are_millimetres_and_float_images_metres(tmp_path, kind, 
 @pytest.mark.parametrize(
     ("sideways", "fits"), [((9e4, 1), True), ((1.1e5, 1), False), ((1, -1.1e5), False), ((-9e4, 9e4), True)]
 )
-def test_map_coordinates_are_refused(tmp_path, sideways, fits):
+def test_map_coordinates_are_rejected(tmp_path, sideways, fits):
     """The median decides, so outliers do not matter, and lengths are compared in metres."""
     rows = np.column_stack([np.tile(sideways, (5, 1)), np.full(5, 300.0)])
     rows[:2, :2] = (1e7, -1e7) if fits else (0, 0)
@@ -134,12 +134,12 @@ def test_map_coordinates_are_refused(tmp_path, sideways, fits):
         if fits:
             assert len(read_points(tmp_path / "p.npy", scale=scale)) == 5
             continue
-        got = f"{abs(sideways[0]):.0f} and {abs(sideways[1]):.0f} m, a map's"
+        got = f"{abs(sideways[0]):.0f} and {abs(sideways[1]):.0f} m \\(map coordinates\\)"
         sentence = (
             r"\Apoints must be points in the frame of the left camera \(x right, y down, z "
             r"forward\); got .* with "
         )
-        with pytest.raises(InputError, match=rf"{sentence}x and y of {got}\. Move them there"):
+        with pytest.raises(InputError, match=rf"{sentence}x and y of {got}\. Transform them with"):
             read_points(tmp_path / "p.npy", scale=scale)
 
 
@@ -182,7 +182,9 @@ def test_las_points_are_read(tmp_path):
 def test_las_errors_name_the_missing_package(tmp_path, monkeypatch):
     laspy = pytest.importorskip("laspy")
     (tmp_path / "q.laz").write_bytes(b"LASF")
-    run = r"Run: pip install 'laspy\[lazrs\]', or convert it: pdal translate FILE out\.ply\."
+    run = (
+        r"Install it with: pip install 'laspy\[lazrs\]', or convert the file: pdal translate FILE out\.ply\."
+    )
 
     def refused(words):
         with pytest.raises(InputError, match=rf"\Aknown must be {words}\Z"):
@@ -196,13 +198,13 @@ def test_las_errors_name_the_missing_package(tmp_path, monkeypatch):
 
     fail(laspy.LaspyException("bad"))
     for backends, words in (
-        ((1,), r"a whole LAS file; got .*q\.laz \(bad\)\. Is it cut off\?"),
+        ((1,), r"a whole LAS file; got .*q\.laz \(bad\)\. It may be truncated\."),
         ((), rf"a LAS file, or LAZ with laspy's lazrs; got .*q\.laz \(bad\)\. {run}"),
     ):
         monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda backends=backends: backends)
         refused(words)
     fail(ValueError("odd"))
-    refused(r"a whole LAS file; got .*q\.laz \(odd\)\. Is it cut off\?")
+    refused(r"a whole LAS file; got .*q\.laz \(odd\)\. It may be truncated\.")
     monkeypatch.setitem(sys.modules, "laspy", None)
     refused(rf"a map \(16-bit PNG .*\); got .*q\.laz\. {run}")
 
@@ -212,7 +214,7 @@ def test_las_errors_name_the_missing_package(tmp_path, monkeypatch):
     [
         (
             "p.bin",
-            r"got .*p\.bin, points of a lidar in its own frame \(KITTI's velodyne\)\. geodiff depth reads",
+            r"got .*p\.bin, points of a lidar in its own frame \(KITTI's velodyne\)\. Pass",
         ),
         ("p.h5", r"got .*p\.h5, an HDF5 or MATLAB file\. Save its map"),
         ("p.HDF5", r"got .*p\.HDF5, an HDF5 or MATLAB file\. Save its map"),

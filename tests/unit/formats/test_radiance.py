@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import radiance
 from tests.unit.formats.calibrated_pair import words
 from tests.unit.formats.posed_images import (
@@ -73,21 +73,20 @@ def test_llff_rows_follow_the_image_names_as_text(scan):
     for path in (scan, scan / "poses_bounds.npy"):
         assert_is_read(radiance.read_llff(path), "LLFF", None, files, Ks=Ks)
     files[0].unlink()
-    sentence = (
-        r"\Aposes_bounds\.npy must be of as many rows as there are images \(1, 2, 2\); got 3\. Its poses "
-    )
+    sentence = r"\Aposes_bounds\.npy must be an array with one row per image \(1, 2, 2\); got 3\. Its poses "
     with pytest.raises(
-        InputError, match=sentence + r"have no names: images/ must hold those images, and no other\."
+        InputError, match=sentence + r"have no names, so images/ must contain exactly those images\."
     ):
         radiance.read_llff(scan)
     np.save(scan / "poses_bounds.npy", llff_rows()[:, :16])
     with pytest.raises(
-        InputError, match=r"\Aposes_bounds\.npy must be of rows of 17 numbers; got shape \(3, 16\) in "
+        InputError,
+        match=r"\Aposes_bounds\.npy must be an array with rows of 17 numbers; got shape \(3, 16\) in ",
     ):
         radiance.read_llff(scan)
     np.save(scan / "poses_bounds.npy", llff_rows()[0])
     with pytest.raises(
-        InputError, match=r"\Aposes_bounds\.npy must be of rows of 17 numbers; got shape \(17,\)"
+        InputError, match=r"\Aposes_bounds\.npy must be an array with rows of 17 numbers; got shape \(17,\)"
     ):
         radiance.read_llff(scan)
     (scan / "poses_bounds.npy").unlink()
@@ -96,7 +95,7 @@ def test_llff_rows_follow_the_image_names_as_text(scan):
     for folder in ("images", "images_4", "input"):
         for file in (scan / folder).iterdir():
             file.unlink()
-    with pytest.raises(InputError, match=r"as there are images \(none\); got 3\."):
+    with pytest.raises(InputError, match=r"an array with one row per image \(none\); got 3\."):
         radiance.read_llff(scan)
 
 
@@ -125,7 +124,7 @@ def test_neus_projections_may_be_scaled(scan, name, folder):
     del matrices["world_mat_1"]
     np.savez(scan / name, **matrices)
     problems = [each.problem for each in radiance.read_neus(scan).candidates]
-    assert problems == ["", "its entries do not read (KeyError: 'world_mat_1')", ""]
+    assert problems == ["", "its entries cannot be read (KeyError: 'world_mat_1')", ""]
     for file in files:
         file.unlink()
     assert radiance.read_neus(scan) is None
@@ -169,23 +168,23 @@ def test_nerfies_orientation_is_world_to_camera(scan, folder):
         (scan / "camera" / name).with_suffix(".json").write_text(json.dumps(entries))
     Ks = [K + [[0, 0.5 + n, 0], [0, 0, 0], [0, 0, 0]] for n, K in enumerate(KS)]
     lenses = [(0.1, 0.2 + n, 0.4 + n, 0.5, 0.3) for n in range(3)]
-    assert_is_read(radiance.read_nerfies(scan), "Nerfies", None, files, Ks=Ks, lenses=lenses)
+    assert_is_read(radiance.NERFIES(scan), "Nerfies", None, files, Ks=Ks, lenses=lenses)
 
 
 def test_nerfies_cameras_may_omit_zero_entries(scan):
     files = write_images(scan / "rgb" / "1x", NAMES)
     write_images(scan / "rgb" / "2x", NAMES)
     (scan / "camera").mkdir()
-    assert radiance.read_nerfies(scan) is None
+    assert radiance.NERFIES(scan) is None
     bare = nerfies_camera(
         2, skew=None, pixel_aspect_ratio=None, radial_distortion=[], tangential_distortion=None
     )
     (scan / "camera" / "c.json").write_text(json.dumps(bare))
     (scan / "camera" / "b.json").write_text('{"orientation": 1, "position": 2}')
-    layout = radiance.read_nerfies(scan)
+    layout = radiance.NERFIES(scan)
     assert [each.frame.image for each in layout.candidates] == files
     assert layout.candidates[1].problem == (
-        "the camera of b must be one of Nerfies; got no focal_length, image_size, principal_point."
+        "the camera of b must be a camera of Nerfies; got no focal_length, image_size, principal_point."
     )
     assert "the camera of a" in layout.candidates[0].problem
     camera = layout.candidates[2].camera
@@ -228,7 +227,7 @@ def test_nsvf_needs_images_poses_and_a_camera(scan):
     for n in range(2):
         (scan / "pose" / f"{n}.txt").write_text(words(POSES[n]))
     with pytest.raises(
-        InputError, match=r"\Apose/ must be of 3 files, one for each image of rgb/; got 2\. Images and"
+        InputError, match=r"\Apose/ must be a folder of 3 files, one per image in rgb/; got 2\. NSVF"
     ):
         radiance.read_nsvf(scan)
     (scan / "intrinsics.txt").unlink()

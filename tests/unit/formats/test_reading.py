@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError, UnknownFormatError, noted
+from geodiff_plugin._internal.checks import InputError, UnknownFormatError, captured_warnings
 from geodiff_plugin.formats import reading
-from geodiff_plugin.formats.rigs import Camera, make_rig
+from geodiff_plugin.formats.rigs import RawCamera, make_rig
 from tests.contracts.calibrations import SAMPLES, written
+from tests.unit.error_sentences import check_error
 from tests.unit.formats.calibrated_pair import (
     K_LEFT,
     K_RIGHT,
@@ -18,6 +19,7 @@ from tests.unit.formats.calibrated_pair import (
     SIZE_RIGHT,
     E,
 )
+from tests.views import lenses_of
 
 #: Formats with one file per camera, and formats with a varying number of files.
 OF_TWO_FILES = {"robotcar", "vkitti", "mvsnet", "mrcal", "euroc", "ros", "colmap"}
@@ -59,7 +61,7 @@ def test_every_sample_is_recognized_with_its_formats_properties(sample):
     assert entry.file_counts == OF_SEVERAL.get(name, (2,) if name in OF_TWO_FILES else (1,))
     assert entry.uses_cameras == (name in OF_MANY_CAMERAS)
     assert entry.by_image == (name in OF_IMAGES) and entry.as_stored == (name in AS_STORED)
-    named = entry.beside(SAMPLES[sample][0]) if entry.beside else None
+    named = entry.companions(SAMPLES[sample][0]) if entry.companions else None
     assert named == (["file1.dat", "file2.dat"] if name == "vins" else None)
 
 
@@ -82,26 +84,26 @@ def test_the_number_of_files_must_fit_the_format(name):
             f"calibration must be {counts} {noun} of this format, {entry.summary}; got {got}. "
         )
         assert reported.endswith("K and E of the pair.") == (count > 1)
-        assert reported.endswith("(in Python two paths).") == (count == 1)
+        assert reported.endswith("(in Python, two paths).") == (count == 1)
 
 
-def test_unknown_and_mixed_formats_are_refused():
+def test_unknown_and_mixed_formats_are_rejected():
     with pytest.raises(
         UnknownFormatError,
         match=r"\Acalibration must be in a known format \(middlebury, .*named\); "
-        r"got b\.txt, which is none of them\. Is this the right file\?",
+        r"got b\.txt, in another format\. Check the file, or pass",
     ):
         reading._format_of({Path("a.txt"): SAMPLES["kalibr"][0], Path("b.txt"): "some words\n"})
     two = {Path("a.txt"): SAMPLES["mvsnet"][0], Path("b.txt"): SAMPLES["euroc"][1]}
     with pytest.raises(
-        InputError, match=r"\Acalibration must be files of one format; got euroc and mvsnet\.\Z"
+        InputError, match=r"\Acalibration must be files of the same format; got euroc and mvsnet\.\Z"
     ):
         reading._format_of(two)
-    with pytest.raises(InputError, match=r"\Acalibration must be files of one format; got none\.\Z"):
+    with pytest.raises(InputError, match=r"\Acalibration must be files of the same format; got none\.\Z"):
         reading._format_of({})
 
 
-RIG = make_rig(Camera(K_LEFT, SIZE_LEFT, LENS_LEFT[:5]), Camera(K_RIGHT, SIZE_RIGHT, LENS_RIGHT[:5]), E)
+RIG = make_rig(RawCamera(K_LEFT, SIZE_LEFT, LENS_LEFT[:5]), RawCamera(K_RIGHT, SIZE_RIGHT, LENS_RIGHT[:5]), E)
 
 
 def test_measured_baseline_overrides_the_file():
@@ -112,7 +114,7 @@ def test_measured_baseline_overrides_the_file():
         np.testing.assert_array_equal(rig.E[:3, :3], E[:3, :3])
         assert rig.unit == "m" and rig.measured
     assert reading._in_metres(RIG, None, False) is RIG
-    with noted() as reported, pytest.warns(UserWarning, match="has no unit: depth comes out"):
+    with captured_warnings() as reported, pytest.warns(UserWarning, match="has no unit, so depth is"):
         rig = reading._in_metres(RIG, None, True)
     assert (rig.unit, rig.measured) == (None, False) and [each.code for each in reported] == [
         "calibration.no-unit"
@@ -123,9 +125,9 @@ def test_measured_baseline_overrides_the_file():
             InputError, match=r"\Abaseline_m must be between 2\.2\S+e-308 and 1000000000; got "
         ):
             reading._in_metres(RIG, bad, True)
-    at_one_place = make_rig(Camera(K_LEFT), Camera(K_RIGHT), np.diag([1.0, 1, 1, 1]))
+    at_one_place = make_rig(RawCamera(K_LEFT), RawCamera(K_RIGHT), np.diag([1.0, 1, 1, 1]))
     with pytest.raises(
-        InputError, match=r"\Abaseline_m must be left out for arguments; got 0\.3\. Both its cameras"
+        InputError, match=r"\Abaseline_m must be omitted for arguments; got 0\.3\. Both its cameras"
     ):
         reading._in_metres(at_one_place, 0.3, False)
 
@@ -140,7 +142,7 @@ def test_distortion_errors_name_the_camera(tmp_path):
     for lenses, side in (((LENS_LEFT[:5], zero), "left"), ((zero, LENS_RIGHT[:5]), "right")):
         path = written(tmp_path, (text(*lenses),))
         rig = reading.read_calibration(path, distorted=True)
-        assert [lens is None for lens in rig.distortion] == [side != "left", side != "right"]
+        assert [lens is None for lens in lenses_of(rig)] == [side != "left", side != "right"]
         assert rig.source == str(path)
         lens = r"opencv \[-0\.21 *," if side == "left" else r"opencv \[-0\.19 *,"
         sentence = (
@@ -151,10 +153,27 @@ def test_distortion_errors_name_the_camera(tmp_path):
             reading.read_calibration(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "cut"),
+    [
+        ("cam0:\n  camera_model: pinhole\ncam1:\n  camera_model: pinhole\n", False),
+        ('{"cameraData": []}', False),
+        ("fx: 500\nfy: 500\ncx: 1\ncy: 1\n", False),
+        ("[LEFT_CAM_HD]\nfx=1\n[RIGHT_CAM_HD]\nfx=1\n", False),
+        ('{"cameraData": [[1, {"intr', True),
+        ("cam0:\n  camera_model: pinhole\ncam1:\n  intrinsics: [458.6, 45", True),
+    ],
+)
+def test_only_a_file_that_ends_in_the_middle_is_asked_whether_it_was_cut_off(text, cut, tmp_path):
+    with pytest.raises(InputError) as caught:
+        reading.read_calibration(written(tmp_path, (text,)), image_size=(1280, 720))
+    assert ("truncated" in str(caught.value)) == cut
+
+
 def test_camera_choice_needs_a_file_with_more_than_two(tmp_path):
     path = written(tmp_path, SAMPLES["middlebury"])
     with pytest.raises(
-        InputError, match=r"\Acameras must be left out for a file of two cameras; got \(0, 1\)\. It ch"
+        InputError, match=r"\Acameras must be omitted for a file of two cameras; got \(0, 1\)\. It sel"
     ):
         reading.read_calibration(path, cameras=(0, 1))
     kitti = written(tmp_path, SAMPLES["kitti_projections"])
@@ -220,7 +239,61 @@ def test_referenced_files_are_read_from_the_same_folder(tmp_path):
         (tmp_path / name).write_text(f"model_type: {name}\n")
     text = 'cam0_calib: "l.yaml"\ncam1_calib: "../away/r.yaml"\n'
     entry = reading.CALIBRATION_FORMATS["vins"]
-    texts = reading._with_beside(entry, {tmp_path / "config.yaml": text})
+    texts = reading._with_companions(entry, {tmp_path / "config.yaml": text})
     assert texts == (text, "model_type: l.yaml\n", "model_type: r.yaml\n")
     other = reading.CALIBRATION_FORMATS["mvsnet"]
-    assert reading._with_beside(other, {Path("a"): "1", Path("b"): "2"}) == ("1", "2")
+    assert reading._with_companions(other, {Path("a"): "1", Path("b"): "2"}) == ("1", "2")
+
+
+@pytest.mark.parametrize(
+    ("call", "parts"),
+    [
+        (
+            lambda p: reading.read_calibration(3),
+            ("calibration", "a path, or a pair of paths (left, right)", "int"),
+        ),
+        (
+            lambda p: reading.read_calibration(p / "words.txt"),
+            (
+                "calibration",
+                "in a known format (",
+                "{}/words.txt, in another format",
+                "Check the file, or pass",
+            ),
+        ),
+        (
+            lambda p: reading.read_calibration((p / "mvsnet.txt", p / "euroc.txt")),
+            ("calibration", "files of the same format", "euroc and mvsnet"),
+        ),
+        (
+            lambda p: reading.read_calibration(p / "euroc.txt"),
+            ("calibration", "2 files of this format, pair of EuRoC", "1, {}/euroc.txt", "Pass both"),
+        ),
+        (
+            lambda p: reading.read_calibration((p / "middlebury.txt", p / "other.txt")),
+            (
+                "calibration",
+                "1 file of this format",
+                "2, {0}/middlebury.txt and {0}/other.txt",
+                "a file of both cameras once",
+            ),
+        ),
+        (
+            lambda p: reading.read_calibration(p / "middlebury.txt", (0, 2)),
+            ("cameras", "omitted for a file of two cameras", "(0, 2)", "It selects"),
+        ),
+        (
+            lambda p: reading.read_calibration(p / "middlebury.txt", baseline_m=-1.0),
+            ("baseline_m", "between ", "-1.0"),
+        ),
+    ],
+)
+def test_errors_state_what_was_expected_and_what_was_found(tmp_path, call, parts):
+    texts = {
+        "mvsnet": SAMPLES["mvsnet"][0],
+        "euroc": SAMPLES["euroc"][1],
+        "middlebury": SAMPLES["middlebury"][0],
+    }
+    for name, text in (texts | {"other": texts["middlebury"], "words": "some words"}).items():
+        (tmp_path / f"{name}.txt").write_text(text)
+    check_error(lambda: call(tmp_path), *(part.format(tmp_path) for part in parts))

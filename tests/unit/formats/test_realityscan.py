@@ -78,8 +78,11 @@ def test_the_largest_component_is_read(tmp_path, model):
     layout = realityscan.read_realityscan(tmp_path)
     assert [each.frame.image for each in layout.candidates] == files[1:]
     np.testing.assert_allclose(layout.candidates[1].frame.E, POSES[2], atol=1e-9)
-    (note,) = layout.notes
-    assert note.startswith("The largest component, of 2 images, is used") and "those of 1 images" in note
+    (finding,) = layout.findings
+    assert (
+        finding.startswith("The largest component, with 2 images, is used")
+        and "Others (with 1 images)" in finding
+    )
 
 
 @pytest.mark.parametrize(
@@ -96,9 +99,12 @@ def test_the_largest_component_is_read(tmp_path, model):
         ),
         (
             sidecar(1, Skew=0.5),
-            "a camera of RealityScan must be of square pixels; got skew 0.5, aspect 1.0. In Real",
+            "a camera of RealityScan must be a camera with square pixels; got skew 0.5, aspect 1.0. In Real",
         ),
-        (sidecar(1, AspectRatio=1.1), "of square pixels; got skew 0.0, aspect 1.1. In RealityScan"),
+        (
+            sidecar(1, AspectRatio=1.1),
+            "a camera with square pixels; got skew 0.0, aspect 1.1. In RealityScan",
+        ),
         (sidecar(1, Rotation="1 2"), "xcr:Rotation must be 9 finite numbers; got 2"),
         (sidecar(1, Position="1 2"), "xcr:Position must be 3 finite numbers; got 2"),
         (sidecar(1, DistortionCoeficients="1 2"), "its lens must be 6 finite numbers; got 2"),

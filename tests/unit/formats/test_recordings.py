@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import yaml
 
-from geodiff_plugin._checks import InputError, InputFileError
+from geodiff_plugin._internal.checks import InputError, InputFileError
+from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.recordings import (
     BagFrame,
     BagReader,
     Stamp,
     VideoReader,
-    both_halves,
     is_bag,
     is_video,
     list_pairs,
@@ -22,6 +22,7 @@ from geodiff_plugin.formats.recordings import (
     video_facts,
     write_depth_bag,
 )
+from tests.views import lenses_of
 
 SIZE = (64, 40)
 
@@ -45,8 +46,9 @@ def shade(image: np.ndarray) -> int:
 def test_a_video_has_its_frames_its_rate_and_its_size(video, tmp_path):
     facts = video_facts(video)
     assert facts.frames == 12 and facts.fps == pytest.approx(12.5) and facts.size == SIZE
+    np.testing.assert_allclose(facts.times, np.arange(12) / 12.5, atol=1e-9)
     (tmp_path / "no.mp4").write_bytes(b"no video")
-    with pytest.raises(InputError, match="video must be a video that OpenCV reads; got"):
+    with pytest.raises(InputError, match="video must be a video that OpenCV can read; got"):
         video_facts(tmp_path / "no.mp4")
 
 
@@ -58,19 +60,9 @@ def test_frames_are_read_by_their_number_in_any_order(video):
         red, green = image[..., 0], image[..., 1]
         assert red[:, -8:].mean() > red[:, :8].mean() + 0.3 and green[-8:].mean() > green[:8].mean() + 0.3
         for number in (12, 20):
-            with pytest.raises(InputFileError, match=rf"frame {number} of .* does not decode"):
+            with pytest.raises(InputFileError, match=rf"frame {number} of .* cannot be decoded"):
                 reader.read(number)
         assert shade(reader.read(5)) == 5
-
-
-def test_both_halves_are_the_left_and_the_right_one():
-    image = np.random.default_rng(0).random((4, 10, 3))
-    left, right = both_halves(image)
-    np.testing.assert_array_equal(left, image[:, :5])
-    np.testing.assert_array_equal(right, image[:, 5:])
-    assert left.flags.c_contiguous and right.flags.c_contiguous
-    with pytest.raises(InputError, match="of even width; got 9 pixels wide"):
-        both_halves(image[:, :9])
 
 
 @pytest.mark.parametrize(
@@ -83,7 +75,7 @@ def test_both_halves_are_the_left_and_the_right_one():
         ("a.png", False, False),
     ],
 )
-def test_recordings_are_told_by_their_suffix(name, video, bag, tmp_path):
+def test_recordings_are_recognised_by_their_suffix(name, video, bag, tmp_path):
     assert is_video(Path(name)) == video and is_bag(Path(name)) == bag
     assert not is_bag(tmp_path)
     (tmp_path / "metadata.yaml").touch()
@@ -94,6 +86,8 @@ pytest.importorskip("rosbags")
 from rosbags import rosbag1, rosbag2  # noqa: E402
 from rosbags.highlevel import AnyReader  # noqa: E402
 from rosbags.typesys import Stores, get_typestore  # noqa: E402
+
+from tests.unit.formats import bags  # noqa: E402
 
 typestore = functools.cache(get_typestore)  # which takes long
 START = 1_600_000_000_987_654_321
@@ -159,7 +153,9 @@ def test_every_left_image_has_the_nearest_right_one_that_is_free(suffix, tmp_pat
             assert image.shape == (4, 12, 3) and image.dtype == np.float32
             np.testing.assert_allclose(image[:, :6], 10 * left / 255)
             np.testing.assert_allclose(image[:, 6:], (10 * right + 100) / 255)
-    with pytest.raises(InputError, match=r"of the same moments; got 5 and 7 images, none within 0.0005 s"):
+    with pytest.raises(
+        InputError, match=r"topics of simultaneous images; got 5 and 7 images, none within 0.0005 s"
+    ):
         list_pairs(path, TOPICS, 0.0005)
     with pytest.raises(
         InputError,
@@ -177,13 +173,13 @@ def test_both_images_of_a_pair_must_be_of_one_size(tmp_path):
     path = bag(tmp_path / "a.mcap", {TOPICS[0]: [(0, 0)], TOPICS[1]: [(0, 0)]}, ((6, 4), (8, 5)))
     with (
         BagReader(path, TOPICS, 0.01) as reader,
-        pytest.raises(InputFileError, match="one size; got 6x4 and 8x5"),
+        pytest.raises(InputFileError, match="have equal sizes; got 6x4 and 8x5"),
     ):
         reader.read(0)
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".bag"])
-def test_the_cameras_of_both_topics_are_those_beside_each(suffix, tmp_path):
+def test_the_cameras_of_both_topics_are_those_next_to_each(suffix, tmp_path):
     topics = ("/one/image_rect_color", "/two/image_raw/compressed")
     K = [np.array([[60.0 + n, 0, 31 + n], [0, 61.0 + n, 23], [0, 0, 1]]) for n in range(3)]
     P = [np.column_stack([each, (-7.5 * n, 0, 0.5)]) for n, each in enumerate(K)]
@@ -202,7 +198,7 @@ def test_the_cameras_of_both_topics_are_those_beside_each(suffix, tmp_path):
         for key, expected in zip("DKRP", (np.arange(5.0) + side, k, np.eye(3) + 0.1 * side, p), strict=True):
             np.testing.assert_allclose(entries[key], np.ravel(expected))
     assert len(texts) == 2 and stereo_calibration(path, topics[::-1])[1] == "info1"
-    with pytest.raises(InputError, match="in the bag as /three/camera_info, or given; got neither"):
+    with pytest.raises(InputError, match="in the bag as /three/camera_info, or an option; got neither"):
         stereo_calibration(path, (topics[0], "/three/image"))
 
 
@@ -248,3 +244,113 @@ def test_every_field_of_a_written_depth_is_that_of_its_frame(suffix, encoding, t
         assert info.distortion_model == "plumb_bob" and np.array_equal(D, np.zeros(5))
         assert (info.binning_x, info.binning_y, info.roi.width, info.roi.do_rectify) == (0, 0, 0, False)
         assert (info.roi.x_offset, info.roi.y_offset, info.roi.height) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_sigma_is_a_message_of_the_same_stamp_and_encoding_rounded_up_in_millimetres(
+    suffix, encoding, tmp_path
+):
+    rng, frames = np.random.default_rng(9), []
+    for number in range(3):
+        sigma_m = rng.uniform(1e-4, 0.2, (5, 6)).astype(np.float32)
+        sigma_m[0, :2] = np.nan, 70.0
+        given = None if number == 1 else sigma_m
+        frames.append(BagFrame(Stamp(START + number, START + number), np.ones((5, 6)), np.eye(3), given))
+    assert write_depth_bag(tmp_path / f"d{suffix}", frames, "eye", encoding) == 3
+    with AnyReader([tmp_path / f"d{suffix}"]) as reader:
+        read = [(c.topic, reader.deserialize(raw, c.msgtype), c.msgtype) for c, _, raw in reader.messages()]
+    found = [message for topic, message, _ in read if topic == "/depth/sigma"]
+    stamps = [(message.header.stamp.sec, message.header.stamp.nanosec) for message in found]
+    assert stamps == [divmod(frames[n].stamp.header_ns, 10**9) for n in (0, 2)]
+    assert {kind for topic, _, kind in read if topic == "/depth/sigma"} == {"sensor_msgs/msg/Image"}
+    for message, frame in zip(found, frames[::2], strict=True):
+        assert message.encoding == encoding and message.header.frame_id == "eye"
+        values = message.data.view("<u2" if encoding == "16UC1" else "<f4").reshape(5, 6)
+        if encoding == "32FC1":
+            np.testing.assert_array_equal(values, frame.sigma_m)
+            continue
+        assert values[0, :2].tolist() == [0, 65535] and values.ravel()[2:].min() >= 1
+        above = values.ravel()[2:] / 1000 - frame.sigma_m.ravel()[2:]
+        assert above.min() > -1e-6 and above.max() < 1.001e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_pairs_are_those_of_a_search_through_all_free_images(seed, tmp_path):
+    """In the order of the left images each has the nearest right one that is free, the earlier of two."""
+    rng = np.random.default_rng(seed)
+    lefts, rights = (sorted(rng.choice(250, count, replace=False).tolist()) for count in (13, 15))
+    stamps = {topic: [(at, at + 1) for at in ms] for topic, ms in zip(TOPICS, (lefts, rights), strict=True)}
+    path = bag(tmp_path / "a.mcap", {topic: rng.permutation(each).tolist() for topic, each in stamps.items()})
+    expected, free = [], list(rights)
+    for left in lefts:
+        near = min(free, key=lambda right: abs(right - left), default=None)
+        if near is not None and abs(near - left) <= 12:
+            expected.append((left, near))
+            free.remove(near)
+    found = [tuple((s.header_ns - START) // 10**6 for s in pair) for pair in list_pairs(path, TOPICS, 0.012)]
+    assert found == expected and 4 < len(expected) < 13
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+@pytest.mark.parametrize("topics", [bags.TOPICS, tuple(f"{topic}/compressed" for topic in bags.TOPICS)])
+def test_pairs_are_those_of_the_same_moments(tmp_path, suffix, topics) -> None:
+    path = bags.write_bag(tmp_path / f"drive{suffix}", topics)
+    assert is_bag(path) and not is_bag(tmp_path)
+    stamps = [[header - 10**12 for header, _ in pair] for pair in list_pairs(path, topics, 0.005)]
+    assert stamps == [[0, 10**6], [10**8, 99 * 10**6]]
+    with BagReader(path, topics, 0.005) as reader:
+        for number in (1, 0):
+            for side, image in enumerate(np.split(reader.read(number), 2, axis=1)):
+                assert image.dtype == np.float32
+                np.testing.assert_array_equal(image, bags.rgb(number, side).astype(np.float32) / 255)
+    rig = rig_of(path, topics, tmp_path)
+    assert rig.rectified and rig.size_left == (64, 48) and rig.E[0, 3] == pytest.approx(0.12)
+
+
+@pytest.mark.parametrize(
+    ("bits", "encoding"), [(10, "mono16"), (12, "mono16"), (12, "mono12"), (10, "16UC1")]
+)
+def test_few_bits_in_sixteen_are_scaled_alike_for_both_views(tmp_path, bits, encoding) -> None:
+    full = bags.rgb(0, 0)[..., 0].astype(np.uint16) * (2**bits - 1) // 255
+    full[0, 0] = 2**bits - 1
+    path = bags.write_bag(tmp_path / "a.mcap", encoding=encoding, images=(full, full // 8))
+    with BagReader(path, bags.TOPICS, 0.005) as reader, pytest.warns(UserWarning, match=f"so {bits} bits"):
+        left, right = np.split(reader.read(0), 2, axis=1)
+    np.testing.assert_allclose(left[..., 0], full / (2**bits - 1), atol=1e-6)
+    np.testing.assert_allclose(right[..., 0], (full // 8) / (2**bits - 1), atol=1e-6)
+
+
+def rig_of(path: Path, topics, folder: Path):
+    texts, frame = stereo_calibration(path, topics)
+    assert frame == "optical"
+    files = [folder / f"{number}.yaml" for number in range(2)]
+    for file, text in zip(files, texts, strict=True):
+        file.write_text(text)
+    return read_calibration(files, distorted=True)
+
+
+def test_cameras_of_raw_images(tmp_path) -> None:
+    """A point that both rectified cameras see is where the poses of the raw ones have it."""
+    D, model = [0.1, 0.02, 0, 0], "equidistant"
+    turns = [cv2.Rodrigues(np.array(v))[0] for v in ([0.02, -0.01, 0.03], [-0.01, 0.02, -0.02])]
+    raw_K = bags.K + [[3.0, 0, 2], [0, 4, 1], [0, 0, 0]]
+    rig = rig_of(
+        bags.write_bag(tmp_path / "a.mcap", bags.RAW, model=model, D=D, K=raw_K, R=turns), bags.RAW, tmp_path
+    )
+    assert not rig.rectified and [lens.model for lens in lenses_of(rig)] == ["fisheye"] * 2
+    np.testing.assert_array_equal(rig.right.lens.coefficients, D)
+    np.testing.assert_array_equal(rig.K_left, raw_K)
+    rectified = np.array([0.3, -0.2, 2.0])
+    left, right = turns[0].T @ rectified, turns[1].T @ (rectified - [0.12, 0, 0])
+    np.testing.assert_allclose((rig.T_right_from_left @ [*left, 1])[:3], right, atol=1e-12)
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+@pytest.mark.parametrize("fraction", [0.0, 0.02, 0.5, 0.98])
+def test_a_bag_that_is_cut_off_is_a_sentence(fraction, suffix, tmp_path):
+    whole = bags.write_bag(tmp_path / f"whole{suffix}").read_bytes()
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole[: int(fraction * len(whole))])
+    with pytest.raises(InputError, match=r"cut\.(mcap|bag).*(truncated|empty)"):
+        list_pairs(cut, bags.TOPICS, 0.005)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 from dataclasses import FrozenInstanceError
 from xml.etree import ElementTree
@@ -12,10 +13,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError, InputFileError
+from geodiff_plugin._internal.checks import NEGATIVE_BASELINE, InputError, InputFileError
+from geodiff_plugin.cameras import Distortion
 from geodiff_plugin.formats import rigs
-from geodiff_plugin.formats.rigs import Camera, CameraChoice
-from geodiff_plugin.types import Distortion
+from geodiff_plugin.formats.rigs import CameraChoice, RawCamera
 from tests.unit.formats.calibrated_pair import (
     K_LEFT,
     K_RIGHT,
@@ -80,28 +81,37 @@ ENDED = [
 def test_parser_errors_become_input_errors_that_name_the_file(make, ended):
     """A parser error at the end of the text suggests a truncated file; any other error offers the hint."""
     error = _error(make)
-    with pytest.raises(InputError) as caught, rigs.reading_whole("FILE", "calibration", "x", cure="A cure."):
+    with pytest.raises(InputError) as caught, rigs.reading_file("FILE", "calibration", "x", hint="A cure."):
         raise error
     reported = str(caught.value)
     got = str(error) if isinstance(error, ValueError) else "other entries"
     got = "no 'K'" if isinstance(error, KeyError) else " ".join(got.split())
     assert reported == (
-        f"FILE must be a whole calibration; got {got}. {'Is the file cut off?' if ended else 'A cure.'}"
+        f"FILE must be a whole calibration; got {got}. {'The file seems truncated.' if ended else 'A cure.'}"
     )
     assert caught.value.__suppress_context__ is False
 
 
 def test_input_errors_pass_through_with_the_file_name_in_front():
-    with pytest.raises(InputError, match=r"\AFILE: K is bad\Z"), rigs.reading_whole("FILE", "calibration"):
+    with pytest.raises(InputError, match=r"\AFILE: K is bad\Z"), rigs.reading_file("FILE", "calibration"):
         raise InputError("K is bad")
-    with pytest.raises(InputFileError, match=r"\Athe disk\Z"), rigs.reading_whole("FILE", "calibration"):
+    with pytest.raises(InputFileError, match=r"\Athe disk\Z"), rigs.reading_file("FILE", "calibration"):
         raise InputFileError("the disk")
-    sentence = r"FILE must be a whole x; got other entries\. Is "
-    with refused(rf"{sentence}it of another program\?"), rigs.reading_whole("FILE", "x", "whole\n"):
+    sentence = r"FILE must be a whole x; got other entries\. "
+    with (
+        refused(rf"{sentence}Check that it is the right kind of file\."),
+        rigs.reading_file("FILE", "x", "whole\n"),
+    ):
         raise IndexError("3")
-    with refused(rf"{sentence}the file cut off\?"), rigs.reading_whole("FILE", "x", "whole\n", "{cut"):
+    with (
+        refused(
+            rf"{sentence}The file seems "
+            rf"truncated\."
+        ),
+        rigs.reading_file("FILE", "x", "whole\n", "{cut"),
+    ):
         raise IndexError("3")
-    with rigs.reading_whole("FILE", "x", "{cut"):
+    with rigs.reading_file("FILE", "x", "{cut"):
         pass
 
 
@@ -143,13 +153,19 @@ def test_camera_matrices_and_poses_are_built_from_flat_numbers():
     np.testing.assert_allclose(rigs.transform(E[:3, :3].ravel(), E[:3, 3:], "E"), E, atol=1e-12)
     np.testing.assert_allclose(rigs.pose_of(Rotation.from_matrix(E[:3, :3]), E[:3, 3]), E, atol=1e-12)
     for make, words in (
-        (lambda: rigs.rigid(E[:, :3], "E"), r"E must be rigid: .*; got .* Are rows and columns swapped, .*"),
+        (
+            lambda: rigs.rigid(E[:, :3], "E"),
+            r"E must be rigid, .*; got .* Check for swapped rows and columns, .*",
+        ),
         (lambda: rigs.rigid(range(11), "E"), rf"E must be 16 finite numbers; got 11\. {EDGE}"),
         (
             lambda: rigs.rigid(2 * E[:3], "E"),
-            r"E must be rigid: .* Are rows and columns swapped, or is a scale multiplied in\?",
+            r"E must be rigid, .* Check for swapped rows and columns, or a scale factor\.",
         ),
-        (lambda: rigs.rigid(E.T, "E"), r"E must be rigid with last row .* Are rows and columns swapped, .*"),
+        (
+            lambda: rigs.rigid(E.T, "E"),
+            r"E must be rigid with last row .* Check for swapped rows and columns, .*",
+        ),
         (
             lambda: rigs.transform([1, 2], (0, 0, 0), "E"),
             rf"the rotation of E must be 9 finite numbers; got 2\. {EDGE}",
@@ -181,14 +197,14 @@ def test_central_camera_puts_the_principal_point_midway_between_the_image_edges(
 def test_resizing_keeps_every_point_at_the_same_fraction_of_the_image():
     K = K_LEFT.copy()
     K[0, 1] = 7.25
-    camera = Camera(K, SIZE_LEFT, LENS_LEFT, "radtan")
+    camera = RawCamera(K, SIZE_LEFT, LENS_LEFT, "radtan")
     size = (1230, 920)  # 1.5 times, apart from rounding of the height
     other = rigs.resized(camera, size, "the image", "Crop?")
     assert other.size == size and other.coefficients == LENS_LEFT and other.model == "radtan"
     rays = np.column_stack([np.random.default_rng(0).uniform(-0.4, 0.4, (20, 2)), np.ones(20)])
     before, after = (((rays @ M.T)[:, :2] + 0.5) / s for M, s in ((K, SIZE_LEFT), (other.K, size)))
     np.testing.assert_allclose(after, before, atol=1e-12)
-    without_size = rigs.resized(Camera(K), (30, 40), "the image", "Crop?")
+    without_size = rigs.resized(RawCamera(K), (30, 40), "the image", "Crop?")
     np.testing.assert_array_equal(without_size.K, K)
     assert without_size.size == (30, 40)
 
@@ -196,12 +212,15 @@ def test_resizing_keeps_every_point_at_the_same_fraction_of_the_image():
 @pytest.mark.parametrize(
     ("size", "fits"), [((1008, 500), True), ((1012, 500), False), ((990, 500), False), ((992, 500), True)]
 )
-def test_aspect_ratios_that_differ_by_more_than_one_percent_are_refused_as_crops(size, fits):
-    camera = Camera(K_LEFT, (1000, 500))
+def test_aspect_ratios_that_differ_by_more_than_one_percent_are_rejected_as_crops(size, fits):
+    camera = RawCamera(K_LEFT, (1000, 500))
     if fits:
         assert rigs.resized(camera, size, "the image", "Crop?").size == size
         return
-    words = rf"the image must be of the shape of its camera's images \(1000x500\); got {size[0]}x500\. Crop\?"
+    words = (
+        r"the image must be of the aspect ratio of its camera's images \(1000x500\); "
+        rf"got {size[0]}x500\. Crop\?"
+    )
     with refused(words):
         rigs.resized(camera, size, "the image", "Crop?")
 
@@ -210,14 +229,16 @@ def test_entries_are_selected_by_image_size():
     entries = {(640, 480): "small", (1280, 720): "large"}
     assert rigs.of_size(entries, CameraChoice(image_size=(1280, 720))) == "large"
     assert rigs.of_size({(640, 480): "only"}, CameraChoice()) == "only"
-    name = r"the left image must be of one of the file's sizes \(640x480, 1280x720\); got "
+    name = r"the left image must be of a size in the file \(640x480, 1280x720\); got "
     with refused(f"{name}no image\\."):
         rigs.of_size(dict(reversed(entries.items())), CameraChoice())
-    with refused(f"{name}2560x720\\. A side-by-side image is two\\."):
+    with refused(f"{name}2560x720\\. A side-by-side image contains two images\\."):
         rigs.of_size(entries, CameraChoice(image_size=(2560, 720)))
-    with refused(r"the left image must be of one of the file's sizes \(640x480\); got 480x640\. A .* two\."):
+    with refused(
+        r"the left image must be of a size in the file \(640x480\); got 480x640\. A .* two images\."
+    ):
         rigs.of_size({(640, 480): "only"}, CameraChoice(image_size=(480, 640)))
-    with refused(r"the left image must be of one of the file's sizes \(none\); got no image\."):
+    with refused(r"the left image must be of a size in the file \(none\); got no image\."):
         rigs.of_size({}, CameraChoice())
 
 
@@ -228,8 +249,8 @@ def test_two_cameras_must_differ_and_exist_in_the_file():
         (
             [4],
             (0, 1),
-            "the file must be of two cameras; got one of one camera. Give the stereo calibration, in "
-            "which one camera's pose is given beside the other's.",
+            "the file must be a calibration of two cameras; got one camera. Pass the stereo calibration, "
+            "which has the pose of one camera relative to the other.",
         ),
         ([4, 0, 2], (2, 2), "cameras must be two different cameras of the file (0, 2, 4); got 2,2."),
         ([4, 0, 2], (2, 3), "cameras must be two different cameras of the file (0, 2, 4); got 2,3."),
@@ -257,7 +278,7 @@ def test_image_names_match_by_trailing_path_components():
             "one/left.png",
             "right",
             r"the image must be one image of the file; got one/left\.png, which may be "
-            r"a/one/left\.png and b/one/left\.png\. Add its folder\.",
+            r"a/one/left\.png and b/one/left\.png\. Include its folder\.",
         ),
         (
             "third.png",
@@ -268,7 +289,7 @@ def test_image_names_match_by_trailing_path_components():
         (
             "up/third.png",
             "third.png",
-            r"the images must be two of those in the file; got \.\./up/third\.png "
+            r"the images must be two images of the file; got \.\./up/third\.png "
             r"for both\. Check their names\.",
         ),
         ("x/third.png", "third.png", r"the image must be one of .*; got x/third\.png\. Check its name\."),
@@ -276,7 +297,7 @@ def test_image_names_match_by_trailing_path_components():
         with refused(words):
             pair(left, right)
     with refused(
-        r"image_names must be given, as \('left\.jpg', 'right\.jpg'\), for a file of many images; "
+        r"image_names must be given for a file of many images, such as \('left\.jpg', 'right\.jpg'\); "
         r"got none\."
     ):
         rigs.names_of_pair(names, CameraChoice())
@@ -303,7 +324,7 @@ def test_distortion_below_the_tolerance_counts_as_none(lens, expected):
 )
 def test_coefficient_counts_are_the_ones_opencv_accepts(model, counts):
     for count in range(1, 16):
-        camera = Camera(K_LEFT, coefficients=[0.25 + 0.5 * n for n in range(count)], model=model)
+        camera = RawCamera(K_LEFT, coefficients=[0.25 + 0.5 * n for n in range(count)], model=model)
         if count in counts:
             lens = rigs.lens_of(camera, "it")
             assert lens.model == {"radtan": "opencv"}.get(model, model)
@@ -321,20 +342,20 @@ def test_coefficient_counts_are_the_ones_opencv_accepts(model, counts):
 
 
 def test_zero_coefficients_mean_no_distortion_except_for_a_fisheye():
-    assert rigs.lens_of(Camera(K_LEFT, coefficients=[0, 0, 0]), "it") is None
-    assert rigs.lens_of(Camera(K_LEFT), "it") is None
+    assert rigs.lens_of(RawCamera(K_LEFT, coefficients=[0, 0, 0]), "it") is None
+    assert rigs.lens_of(RawCamera(K_LEFT), "it") is None
     fisheye = rigs.lens_of(
-        Camera(K_LEFT, coefficients=[0.1, 0, 0, 0.2, *[0] * 10], model="Equidistant"), "it"
+        RawCamera(K_LEFT, coefficients=[0.1, 0, 0, 0.2, *[0] * 10], model="Equidistant"), "it"
     )
     assert fisheye.model == "fisheye" and fisheye.coefficients.tolist() == [0.1, 0, 0, 0.2]
-    straight = rigs.lens_of(Camera(K_LEFT, coefficients=[0] * 4, model="KannalaBrandt8"), "it")
+    straight = rigs.lens_of(RawCamera(K_LEFT, coefficients=[0] * 4, model="KannalaBrandt8"), "it")
     assert straight.coefficients.tolist() == [0] * 4
-    with refused(r"the lens model of it must be opencv or fisheye; got omni\. OpenCV does not have .*"):
-        rigs.lens_of(Camera(K_LEFT, model="omni"), "it")
+    with refused(r"the lens model of it must be opencv or fisheye; got omni\. OpenCV lacks .*"):
+        rigs.lens_of(RawCamera(K_LEFT, model="omni"), "it")
     with refused(rf"the lens distortion of it must be finite numbers; got 'x'\. {EDGE}"):
-        rigs.lens_of(Camera(K_LEFT, coefficients="x"), "it")
+        rigs.lens_of(RawCamera(K_LEFT, coefficients="x"), "it")
     with refused(rf"the lens distortion of it must be 4 coefficients in .*fisheye\); got .*\. {EDGE}"):
-        rigs.lens_of(Camera(K_LEFT, coefficients=[1, 2, 3, 4, 5], model="fisheye"), "it")
+        rigs.lens_of(RawCamera(K_LEFT, coefficients=[1, 2, 3, 4, 5], model="fisheye"), "it")
 
 
 @pytest.mark.parametrize("model", rigs.COLMAP_LENSES)
@@ -343,73 +364,93 @@ def test_colmap_models_have_as_many_coefficients_as_in_pycolmap(model, monkeypat
     camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 8, 8)
     count = len(camera.extra_params_idxs())
     numbers = (0.1 * np.arange(1, count + 1)).tolist()
-    lens = rigs.lens_of(Camera(K_LEFT, coefficients=numbers, model=model), "it")
+    lens = rigs.lens_of(RawCamera(K_LEFT, coefficients=numbers, model=model), "it")
     assert (lens.model, lens.coefficients.tolist()) == (model, numbers)
     with pytest.raises(InputError, match=rf"\Athe lens distortion of it must be .*; got {count + 1}\. Check"):
-        rigs.lens_of(Camera(K_LEFT, coefficients=[*numbers, 0.1], model=model), "it")
+        rigs.lens_of(RawCamera(K_LEFT, coefficients=[*numbers, 0.1], model=model), "it")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     monkeypatch.setattr(rigs, "find_spec", lambda name: None)
     with refused(
         rf"the lens model of it must be opencv or fisheye without pycolmap; got {model}\. Run: pip .*"
     ):
-        rigs.lens_of(Camera(K_LEFT, coefficients=numbers, model=model), "it")
+        rigs.lens_of(RawCamera(K_LEFT, coefficients=numbers, model=model), "it")
 
 
 def test_make_rig_keeps_each_cameras_own_matrix_size_and_lens():
-    left = Camera(K_LEFT, SIZE_LEFT, LENS_LEFT[:5])
-    right = Camera(K_RIGHT, [str(side) for side in SIZE_RIGHT], LENS_RIGHT[:5])
+    left = RawCamera(K_LEFT, SIZE_LEFT, LENS_LEFT[:5])
+    right = RawCamera(K_RIGHT, [str(side) for side in SIZE_RIGHT], LENS_RIGHT[:5])
     assert_is_the_pair(rigs.make_rig(left, right, E))
     with pytest.raises(TypeError, match="positional"):
         rigs.make_rig(left, right, E, True)
     assert_is_the_pair(rigs.make_rig(left=left, right=right, pose=E))
     for rectified in (True, False):
-        assert not rigs.make_rig(left, Camera(K_RIGHT), E, rectified=rectified).rectified
-        assert not rigs.make_rig(Camera(K_LEFT), right, E, rectified=rectified).rectified
-        both = rigs.make_rig(Camera(K_LEFT), Camera(K_RIGHT), 0.173, rectified=rectified)
+        assert not rigs.make_rig(left, RawCamera(K_RIGHT), E, rectified=rectified).rectified
+        assert not rigs.make_rig(RawCamera(K_LEFT), right, E, rectified=rectified).rectified
+        both = rigs.make_rig(RawCamera(K_LEFT), RawCamera(K_RIGHT), 0.173, rectified=rectified)
         assert_is_parallel(both, K_LEFT, K_RIGHT, rectified=rectified)
-    assert rigs.make_rig(Camera(K_LEFT, (None, None)), right, 1.0).size_left is None
-    one = rigs.make_rig(left, Camera(K_RIGHT, (1, 1)), 1.0)
-    assert one.size_right == (1, 1) and one.distortion[1] is None
+    assert rigs.make_rig(RawCamera(K_LEFT, (None, None)), right, 1.0).size_left is None
+    one = rigs.make_rig(left, RawCamera(K_RIGHT, (1, 1)), 1.0)
+    assert one.size_right == (1, 1) and one.right.lens is None
 
 
 @pytest.mark.parametrize(
     ("left", "right", "pose_", "words"),
     [
-        (Camera(K_LEFT), Camera(K_RIGHT), 0.0, rf"the baseline must be above 0; got 0\.0\. {EDGE}"),
-        (Camera(K_LEFT), Camera(K_RIGHT), "x", rf"the baseline must be a finite number; got 'x'\. {EDGE}"),
-        (Camera(K_LEFT), Camera(K_RIGHT), [1, 2], rf"the pose must be 16 finite numbers; got 2\. {EDGE}"),
+        (RawCamera(K_LEFT), RawCamera(K_RIGHT), 0.0, rf"the baseline must be positive; got 0\.0\. {EDGE}"),
         (
-            Camera([1]),
-            Camera(K_RIGHT),
+            RawCamera(K_LEFT),
+            RawCamera(K_RIGHT),
+            "x",
+            rf"the baseline must be a finite number; got 'x'\. {EDGE}",
+        ),
+        (
+            RawCamera(K_LEFT),
+            RawCamera(K_RIGHT),
+            [1, 2],
+            rf"the pose must be 16 finite numbers; got 2\. {EDGE}",
+        ),
+        (
+            RawCamera([1]),
+            RawCamera(K_RIGHT),
             1.0,
             rf"K of the left camera must be 9 finite numbers; got 1\. {EDGE}",
         ),
-        (Camera(K_LEFT), Camera(-K_RIGHT), 1.0, r"K of the right camera\[0, 0\] and .* must be positive .*"),
         (
-            Camera(K_LEFT, (0, 5)),
-            Camera(K_RIGHT),
+            RawCamera(K_LEFT),
+            RawCamera(-K_RIGHT),
+            1.0,
+            r"K of the right camera\[0, 0\] and .* must be positive .*",
+        ),
+        (
+            RawCamera(K_LEFT, (0, 5)),
+            RawCamera(K_RIGHT),
             1.0,
             r"the width and height of the left camera must be whole numbers of pixels; got \[0, "
             rf"5\]\. {EDGE}",
         ),
         (
-            Camera(K_LEFT),
-            Camera(K_RIGHT, (5, 0.5)),
+            RawCamera(K_LEFT),
+            RawCamera(K_RIGHT, (5, 0.5)),
             1.0,
             r"the width and height of the right camera must be whole numbers of pixels; got \[5, "
             rf"0\.5\]\. {EDGE}",
         ),
-        (Camera(K_LEFT), Camera(K_RIGHT, (6.5, 5)), 1.0, r"the width and height of the right camera .*"),
-        (Camera(K_LEFT, (5, 6.5)), Camera(K_RIGHT), 1.0, r"the width and height of the left camera .*"),
         (
-            Camera(K_LEFT, (5, None)),
-            Camera(K_RIGHT),
+            RawCamera(K_LEFT),
+            RawCamera(K_RIGHT, (6.5, 5)),
+            1.0,
+            r"the width and height of the right camera .*",
+        ),
+        (RawCamera(K_LEFT, (5, 6.5)), RawCamera(K_RIGHT), 1.0, r"the width and height of the left camera .*"),
+        (
+            RawCamera(K_LEFT, (5, None)),
+            RawCamera(K_RIGHT),
             1.0,
             rf"the width and height of the left camera must be 2 finite numbers; got \(5, None\)\. {EDGE}",
         ),
         (
-            Camera(K_LEFT),
-            Camera(K_RIGHT, model="omni"),
+            RawCamera(K_LEFT),
+            RawCamera(K_RIGHT, model="omni"),
             1.0,
             r"the lens model of the right camera must be .*",
         ),
@@ -439,7 +480,7 @@ def test_rectified_projections_give_camera_centres_and_baseline():
 
 
 def test_in_units_converts_every_length_to_metres():
-    left, right = Camera(K_LEFT, SIZE_LEFT), Camera(K_RIGHT, SIZE_RIGHT)
+    left, right = RawCamera(K_LEFT, SIZE_LEFT), RawCamera(K_RIGHT, SIZE_RIGHT)
     in_mm = pose((11, -17, 23), (173.0, -41.0, 29.0))
     rectified = rigs.rectified_from(
         rigs.projected(K_LEFT @ np.eye(3, 4), K_RIGHT @ np.eye(3, 4)), left, right, (np.eye(3), np.eye(3))
@@ -463,8 +504,10 @@ def test_rectifying_rotations_lead_back_to_the_original_cameras():
         np.linalg.inv(E)[:3, 3:],
         flags=0,
     )
-    rectified = rigs.make_rig(Camera(K_LEFT), Camera(K_LEFT), float(np.linalg.norm(E[:3, 3])), rectified=True)
-    cameras = Camera(K_LEFT, SIZE_LEFT, LENS_LEFT[:5]), Camera(K_RIGHT, SIZE_RIGHT, LENS_RIGHT[:5])
+    rectified = rigs.make_rig(
+        RawCamera(K_LEFT), RawCamera(K_LEFT), float(np.linalg.norm(E[:3, 3])), rectified=True
+    )
+    cameras = RawCamera(K_LEFT, SIZE_LEFT, LENS_LEFT[:5]), RawCamera(K_RIGHT, SIZE_RIGHT, LENS_RIGHT[:5])
     rig = rigs.rectified_from(rectified, *cameras, (R_left.ravel().tolist(), R_right))
     assert_is_the_pair(rig.as_taken)
     np.testing.assert_array_equal(rig.E, rectified.E)
@@ -486,7 +529,7 @@ def test_data_sheet_parameters_make_a_parallel_rig():
     for at, words in (
         (0, r"fx must be a finite number of pixels above 0; got -1\."),
         (1, r"fy must be a finite number of pixels above 0; got -1\."),
-        (4, r"baseline must be a finite number of metres above 0; got -1\."),
+        (4, rf"baseline must be a finite number of metres above 0; got -1\. {re.escape(NEGATIVE_BASELINE)}"),
     ):
         with refused(words):
             rigs.rig_from_parameters(*numbers[:at], -1, *numbers[at + 1 :])
@@ -515,9 +558,9 @@ def test_common_path_components_are_counted_from_the_end(first, second, shared):
 
 def test_defaults_of_the_dataclasses():
     assert CameraChoice() == CameraChoice(None, None, None, None, None)
-    camera = Camera(K_LEFT)
+    camera = RawCamera(K_LEFT)
     assert (camera.size, tuple(camera.coefficients), camera.model) == (None, (), "opencv")
     entry = rigs.CalibrationFormat("s", "m", lambda texts, choice: None)
-    assert (entry.file_counts, entry.uses_cameras, entry.by_image, entry.as_stored, entry.beside) == (
+    assert (entry.file_counts, entry.uses_cameras, entry.by_image, entry.as_stored, entry.companions) == (
         *((1,), False, False, False, None),
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import sequences
 from tests.unit.formats.calibrated_pair import quaternion, words
 from tests.unit.formats.posed_images import (
@@ -19,6 +19,7 @@ from tests.unit.formats.posed_images import (
     numbers,
     write_images,
 )
+from tests.videos import write_video
 
 SEVEN = np.array([[525.0, 0, 320], [0, 525, 240], [0, 0, 1]])
 TUM = np.array([[525.0, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
@@ -55,9 +56,9 @@ def info(colour=(KS[1], SIZES[1]), depth=(KS[1], SIZES[1]), shift="1234") -> str
 def test_seven_scenes_has_one_pose_file_per_image_and_a_published_camera(tmp_path):
     files, expected = write_7scenes(tmp_path)
     layout = sequences.read_tracked(tmp_path)
-    camera = {"Ks": [SEVEN] * 3, "sizes": [VGA] * 3, "notes": ["capture.assumed-k"]}
+    camera = {"Ks": [SEVEN] * 3, "sizes": [VGA] * 3, "findings": ["capture.assumed-k"]}
     assert_is_read(layout, "7-Scenes", "m", files, **expected, **camera)
-    assert layout.notes[0].startswith("Assumed: K of the cameras of 7-Scenes, 525 px at 640x480")
+    assert layout.findings[0].startswith("K of 7-Scenes is assumed (525 px")
     lost = POSES[1].copy()
     lost[:3, 3] = np.inf
     (tmp_path / "frame-01.pose.txt").write_text("\n".join(words(row) for row in lost))
@@ -168,7 +169,9 @@ def test_replica_has_one_pose_per_line_and_a_shared_camera(tmp_path, above):
         sequences.read_replica(scene)
     (scene / "traj.txt").write_text("\n".join(words(E) for E in POSES[:2]))
     params.unlink()
-    with pytest.raises(InputError, match=r"\A\S*traj\.txt must be of 3 lines, one for each image; got 2\."):
+    with pytest.raises(
+        InputError, match=r"\A\S*traj\.txt must be a file with 3 lines, one per image; got 2\."
+    ):
         sequences.read_replica(scene)
     (scene / "traj.txt").unlink()
     assert sequences.read_replica(scene) is None
@@ -195,6 +198,12 @@ def assert_poses_near(layout, atol=0.02):
         np.testing.assert_allclose(each.frame.E, E, atol=atol)
 
 
+def test_tum_lists_may_have_paths_of_windows(tmp_path):
+    files, _ = write_tum(tmp_path)
+    (tmp_path / "rgb.txt").write_text("\n".join(f"{t} .\\rgb\\{t}.png" for t in TIMES))
+    assert [each.frame.image for each in sequences.read_tum(tmp_path).candidates] == files
+
+
 def test_tum_images_get_the_nearest_pose_and_depth_map(tmp_path):
     files, depths = write_tum(tmp_path)
     layout = sequences.read_tum(tmp_path)
@@ -204,7 +213,7 @@ def test_tum_images_get_the_nearest_pose_and_depth_map(tmp_path):
     assert [each.frame.depth for each in layout.candidates] == depths
     assert [each.frame.depth_per_m for each in layout.candidates] == [5000.0] * 3
     assert (layout.kind, layout.unit) == ("TUM RGB-D", "m")
-    assert [note.code for note in layout.notes] == ["capture.assumed-k"]
+    assert [finding.code for finding in layout.findings] == ["capture.assumed-k"]
     for each in layout.candidates:
         np.testing.assert_array_equal(each.camera.K, TUM)
         assert each.camera.size == VGA
@@ -212,7 +221,7 @@ def test_tum_images_get_the_nearest_pose_and_depth_map(tmp_path):
     assert [each.frame.depth for each in sequences.read_tum(tmp_path).candidates] == [None] * 3
     (tmp_path / "K.txt").write_text(words(KS[2]))
     layout = sequences.read_tum(tmp_path)
-    assert not layout.notes and layout.candidates[1].camera.K[0, 0] == KS[2][0, 0]
+    assert not layout.findings and layout.candidates[1].camera.K[0, 0] == KS[2][0, 0]
     (tmp_path / "rgb.txt").rename(tmp_path / "away")
     assert sequences.read_tum(tmp_path) is None
     (tmp_path / "away").rename(tmp_path / "rgb.txt")
@@ -268,7 +277,7 @@ def test_tum_camera_is_chosen_by_sequence_name(tmp_path, number, where):
     for each in layout.candidates:
         np.testing.assert_array_equal(each.camera.K, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         assert each.camera.size == VGA and list(each.camera.coefficients) == lens
-    assert not layout.notes
+    assert not layout.findings
 
 
 def test_trajectory_poses_are_interpolated():
@@ -276,7 +285,7 @@ def test_trajectory_poses_are_interpolated():
     times = np.array([3.0, 1.0, 1.08, 1.0])
     places = np.array([[9.0, 9, 9], [1, 2, 3], [3, -2, 4], [8, 8, 8]])
     turns = Rotation.from_matrix([POSES[0][:3, :3], POSES[1][:3, :3], POSES[2][:3, :3], POSES[0][:3, :3]])
-    pose_at = sequences.poses_by_time(times, places, turns.as_quat())
+    pose_at = sequences.TimedPoses(times, places, turns.as_quat())
     between = pose_at(1.02)
     np.testing.assert_allclose(between[:3, 3], 0.75 * places[1] + 0.25 * places[2])
     slerp = Slerp([1.0, 1.08], turns[[1, 2]])
@@ -318,33 +327,77 @@ def test_video_frames_take_poses_from_the_trajectory(tmp_path):
     layout = sequences.read_video(file)
     frames = [each.frame for each in layout.candidates]
     assert [frame.name for frame in frames] == ["000000", "000001", "000002"]
-    assert [(frame.index, frame.size, frame.image, frame.E) for frame in frames] == [
-        (n, (64, 48), file, None) for n in range(3)
-    ]
+    assert [(frame.index, frame.image, frame.E) for frame in frames] == [(n, file, None) for n in range(3)]
+    assert [(each.camera.K, each.camera.size) for each in layout.candidates] == [(None, (64, 48))] * 3
     assert (layout.kind, layout.unit) == ("video", "m")
-    assert [note.code for note in layout.notes] == ["capture.no-trajectory"]
+    assert [finding.code for finding in layout.findings] == ["capture.no-trajectory"]
     lines = [f"{n / 8} {words([*E[:3, 3], *quaternion(E)])}" for n, E in enumerate(POSES)]
     trajectory.write_text("\n".join(lines))
     layout = sequences.read_video(file, trajectory)
     for each, E in zip(layout.candidates, POSES, strict=True):
         np.testing.assert_allclose(each.frame.E, E, atol=1e-9)
-    assert not layout.notes
+    assert not layout.findings
     assert sequences.read_video(tmp_path) is None and sequences.read_video(trajectory) is None
+
+
+#: Times of frames of a phone, whose rate varies; at their mean rate all but a few are .05 s off or more.
+FRAME_TIMES = np.array([0.0, 0.033, 0.066, 0.266, 0.299, 0.499, 0.532, 0.932, 0.965, 1.0])
+
+
+def slide(file, times) -> None:
+    """A trajectory that moves by one metre per second along x."""
+    file.write_text("\n".join(f"{t:.6f} {t:.6f} 0 0 0 0 0 1" for t in times))
+
+
+def test_frames_of_a_variable_rate_have_the_poses_of_their_own_times(tmp_path):
+    file = write_video(
+        tmp_path / "v.mp4", [np.full((48, 64, 3), 20 * n, np.uint8) for n in range(10)], FRAME_TIMES
+    )
+    slide(tmp_path / "t.txt", np.arange(0, 1.02, 0.01))
+    layout = sequences.read_video(file, tmp_path / "t.txt")
+    found = [each.frame.E[0, 3] for each in layout.candidates]
+    np.testing.assert_allclose(found, FRAME_TIMES, atol=1e-3)
+    assert not layout.findings
+
+
+def test_a_trajectory_of_other_times_is_reported(tmp_path):
+    file = write_video(
+        tmp_path / "v.mp4", [np.full((48, 64, 3), 20 * n, np.uint8) for n in range(10)], FRAME_TIMES
+    )
+    slide(tmp_path / "t.txt", np.arange(0, 0.4, 0.01))
+    layout = sequences.read_video(file, tmp_path / "t.txt")
+    (finding,) = layout.findings
+    assert finding.code == "capture.trajectory-times"
+    assert "Only 5 of 10 frames have a pose within 0.05 s. The frames are at 0 to 1 s" in finding
+    assert "at 0 to 0.39 s" in finding
+    for start, unit, hint in (
+        (1.6e9, 1.0, "subtract its first time"),
+        (5000.0, 1e3, "in milliseconds. Divide them by 1000"),
+        (1.6e15, 1e6, "in microseconds"),
+        (1.6e18, 1e9, "in nanoseconds. Divide them by 1e[+]09"),
+    ):
+        times = np.arange(0, 1.02, 0.01)
+        rows = [f"{start + t * unit:.6f} {t:.6f} 0 0 0 0 0 1" for t in times]
+        (tmp_path / "t.txt").write_text("\n".join(rows))
+        with pytest.raises(InputError, match=rf"times in the video, 0 to 1 s after its first frame.*{hint}"):
+            sequences.read_video(file, tmp_path / "t.txt")
 
 
 @pytest.mark.parametrize("folder", ["", "images", "input"])
 def test_plain_image_folders_follow_exif_orientation(tmp_path, folder):
     files = write_images(tmp_path / folder, ["b9.png", "b10.png", "b11.png"])
-    layout = sequences.read_photographs(tmp_path)
+    layout = sequences.read_unposed_images(tmp_path)
     assert_is_read(layout, "images without poses", None, files, Ks=None, poses=[None] * 3, as_stored=False)
     for file in files:
         file.unlink()
-    assert sequences.read_photographs(tmp_path) is None
+    assert sequences.read_unposed_images(tmp_path) is None
 
 
 @pytest.mark.parametrize("line", ["1.0 rgb/0.png", "x rgb/1.png 1.0 depth/1.png"])
 def test_a_damaged_list_of_associations_is_named_with_what_it_should_be(tmp_path, line):
     file = tmp_path / "associations.txt"
     file.write_text(f"0.5 rgb/0.png 0.5 depth/0.png\n{line}\n")
-    with pytest.raises(InputError, match=r"associations\.txt.*list of seconds and file names, twice a line"):
+    with pytest.raises(
+        InputError, match=r"associations\.txt.*list of seconds and file names, twice per line"
+    ):
         sequences._associated_names(file)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import storage
 from geodiff_plugin.formats.storage import (
     read_content,
@@ -16,6 +16,7 @@ from geodiff_plugin.formats.storage import (
     text_of_arrays,
     text_of_npz,
 )
+from tests.unit.error_sentences import check_error
 
 RNG = np.random.default_rng(2)
 K = RNG.normal(size=(3, 3))
@@ -47,7 +48,7 @@ def test_what_opencv_writes_is_read_flat_and_by_small_letters(suffix, tmp_path):
     assert entries["model"] == "pinhole" and "K1" not in entries
 
 
-def test_a_name_has_the_side_that_an_outer_name_says(tmp_path):
+def test_a_name_has_the_side_of_its_outer_name(tmp_path):
     text = yaml.safe_dump(
         {
             "LeftCamera": {"fx": 1.0, "lens": {"k": [1, [2, 3]]}},
@@ -94,7 +95,7 @@ def test_entries_are_read_to_a_depth_of_eight():
         ('{"a": 1,\n"b = 2": 3}', {"a": 1, "b = 2": 3}),
     ],
 )
-def test_texts_are_told_apart(text, expected):
+def test_texts_are_distinguished(text, expected):
     content = read_content(text)
     if expected is None:
         assert content["b"] == "x:y"
@@ -102,7 +103,7 @@ def test_texts_are_told_apart(text, expected):
         assert content == expected
 
 
-def test_a_mistake_in_yaml_names_its_line_and_an_early_end_stays_an_error():
+def test_a_yaml_error_names_its_line_and_a_truncated_file_is_an_error():
     with pytest.raises(InputError, match=r"YAML; got 'b: \[1, 2' in line 2 \("):
         read_yaml("a: 1\nb: [1, 2\nc: 3\nd: 4\n")
     long = "x" * 100
@@ -119,7 +120,7 @@ def test_aliases_are_few_and_hold_no_others():
     many = "a: &x [1, 2]\n" + "".join(f"b{n}: *x\n" for n in range(32))
     assert read_yaml(many)["b31"] == [1, 2]
     for text in (many + "c: *x\n", "a: &x [1]\nb: &y [*x]\nc: *y\n", "a: &x [*x]\n"):
-        with pytest.raises(InputError, match="YAML with 32 aliases at most, none of which holds others"):
+        with pytest.raises(InputError, match="YAML with at most 32 aliases, none of them nested"):
             read_yaml(text)
 
 
@@ -167,12 +168,14 @@ def test_small_arrays_of_an_archive_are_entries_by_their_names(tmp_path):
     read = json.loads(text_of_npz(path))
     assert sorted(read) == ["K", "most", "n"] and read["K"] == K.tolist() and read["n"] == 3
     np.savez(path, corners=corners)
-    with pytest.raises(InputError, match="calibration must be a .npz of matrices; got .* of pickled objects"):
+    with pytest.raises(
+        InputError, match="calibration must be a .npz of matrices; got .* with pickled objects"
+    ):
         text_of_npz(path)
     np.savez(path, map=np.arange(650.0))
     assert json.loads(text_of_npz(path)) == {}
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(InputError, match="a whole .npz of matrices; got .*Is it cut off"):
+    with pytest.raises(InputError, match="a whole .npz of matrices; got .*It may be truncated"):
         text_of_npz(path)
 
 
@@ -183,3 +186,31 @@ def test_elements_of_xml_with_one_word_are_texts_unless_they_are_data():
     assert_numbers(entries["b"], [1, 2])
     assert_numbers(entries["c"], [3])
     assert storage.without_sizes({"rows": 3}) == {"rows": 3}
+
+
+@pytest.mark.parametrize(
+    ("call", "parts"),
+    [
+        (
+            lambda p: read_yaml("a: 1\nb: [1, 2\nc: 3\n"),
+            ("the file", "YAML", "'b: [1, 2' in line 2 (", "Correct the line"),
+        ),
+        (lambda p: read_yaml("- 1\n- 2\n"), ("the file", "a YAML file of named entries", "list")),
+        (
+            lambda p: read_yaml("a: &a [1]\n" + "\n".join(f"b{n}: *a" for n in range(33))),
+            ("the file", "YAML with at most 32 aliases", "more", "Replace the"),
+        ),
+        (
+            lambda p: text_of_npz(p / "cut.npz"),
+            ("calibration", "a whole .npz of matrices", "{}/cut.npz (", "It may be truncated."),
+        ),
+        (
+            lambda p: text_of_npz(p / "objects.npz"),
+            ("calibration", "a .npz of matrices", "{}/objects.npz with pickled objects", "Save every matrix"),
+        ),
+    ],
+)
+def test_errors_state_what_was_expected_and_what_was_found(tmp_path, call, parts):
+    np.savez(tmp_path / "objects.npz", a=np.array([{}], object))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "objects.npz").read_bytes()[:-30])
+    check_error(lambda: call(tmp_path), *(part.format(tmp_path) for part in parts))

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.formats import transforms
 from geodiff_plugin.formats.rigs import CameraChoice
 from tests.unit.formats.posed_images import (
@@ -66,7 +66,7 @@ def test_frame_entries_override_shared_entries():
         with pytest.raises(
             InputError,
             match=rf"\Atransforms\.json must be an object with a list 'frames'; got {got}\. "
-            r"Names are in small letters: frames, file_path, transform_matrix\.\Z",
+            r"Names are lower case: frames, file_path, transform_matrix\.\Z",
         ):
             list(transforms.nerf_frames(json.dumps(content)))
 
@@ -104,16 +104,16 @@ def test_focal_lengths_may_be_pixels_or_angles(entries, fx, fy):
 
 def test_errors_name_the_missing_camera_entries():
     with pytest.raises(
-        InputError, match=r"\Athe file must be one with entries 'w' and 'h'; got none\. Give image_s"
+        InputError, match=r"\Athe file must be a file with entries 'w' and 'h'; got none\. Pass image_s"
     ):
         transforms.nerf_camera(frame(0, size=False))
     with pytest.raises(
-        InputError, match=r"\Athe file must be one with an entry 'fl_x' or 'camera_angle_x'; got none\."
+        InputError, match=r"\Athe file must be a file with an entry 'fl_x' or 'camera_angle_x'; got none\."
     ):
         transforms.nerf_camera({"w": 3, "h": 4})
     for angle in (0, math.pi, -0.1, 50.0):
         with pytest.raises(
-            InputError, match=rf"\Acamera_angle_y must be in radians, between 0 and pi; got {angle}\. Is"
+            InputError, match=rf"\Acamera_angle_y must be in radians, between 0 and pi; got {angle}\. It"
         ):
             transforms.nerf_camera({"w": 3, "h": 4, "fl_x": 3, "camera_angle_y": angle})
 
@@ -130,7 +130,7 @@ def test_errors_name_the_missing_camera_entries():
     ],
 )
 @pytest.mark.parametrize("as_list", [True, False])
-def test_lenses_outside_opencv_models_are_refused(entries, model, kind, as_list):
+def test_lenses_outside_opencv_models_are_rejected(entries, model, kind, as_list):
     values = [0.1, -0.2, 0.03, 0.04, 0.005, -0.006]
     if kind == "opencv":
         values[3] = 0.0
@@ -152,7 +152,7 @@ def test_lenses_outside_opencv_models_are_refused(entries, model, kind, as_list)
         wrong = [0.1, 0, 0, 0.3, 0.5, -0.6]
         others, got = ("k4", r"\[0\.3\]") if kind == "opencv" else ("p1 and p2", r"\[0\.5, -0\.6\]")
         with pytest.raises(
-            InputError, match=rf"\A{others} must be zero for {model}; got {got}\. OpenCV does not"
+            InputError, match=rf"\A{others} must be zero for {model}; got {got}\. OpenCV lacks"
         ):
             read(wrong)
 
@@ -247,7 +247,7 @@ def test_capture_frames_follow_the_order_of_the_file(scan, place, by_file):
         poses=moved(POSES),
         lenses=[opencv_order(lens) for lens in moved(LENSES)],
         models=["OPENCV"] * 3,
-        notes=["capture.assumed-metres"],
+        findings=["capture.assumed-metres"],
     )
     assert transforms.read_transforms(files[0]) is None and transforms.read_transforms(scan / "none") is None
     (scan / "other.json").write_text('{"frames": [], "file": 1}')
@@ -299,7 +299,7 @@ def test_poses_from_structure_from_motion_have_no_unit(scan, solved):
         frames[2] |= solved
     layout = transforms.read_transforms(write(scan / "transforms.json", frames))
     assert layout.unit == (None if solved else "m")
-    assert [note.code for note in layout.notes] == ([] if solved else ["capture.assumed-metres"])
+    assert [finding.code for finding in layout.findings] == ([] if solved else ["capture.assumed-metres"])
 
 
 @pytest.mark.parametrize(
@@ -329,7 +329,7 @@ def test_depth_maps_are_found_by_entry_or_by_folder(scan, named, entries, per_m)
     layout = transforms.read_transforms(write(scan / "transforms.json", frames, **entries))
     assert [each.frame.depth for each in layout.candidates] == [None, expected, None]
     assert [each.frame.depth_per_m for each in layout.candidates] == [per_m] * 3
-    assert not layout.notes and len(files) == 3
+    assert not layout.findings and len(files) == 3
     expected.unlink()
     assert transforms.read_transforms(scan).candidates[1].frame.depth is None
 
@@ -338,11 +338,11 @@ def test_depth_factors_must_be_positive():
     for entries, words in (
         (
             {"integer_depth_scale": 0.0},
-            r"\Ainteger_depth_scale must be a finite number of metres a unit above 0",
+            r"\Ainteger_depth_scale must be a finite number of metres per unit above 0",
         ),
         (
             {"depth_scaling_factor": -1},
-            r"\Adepth_scaling_factor must be a finite number of units a metre above 0",
+            r"\Adepth_scaling_factor must be a finite number of units per metre above 0",
         ),
     ):
         with pytest.raises(InputError, match=words):
@@ -362,18 +362,19 @@ def test_frames_without_a_focal_length_have_no_camera(scan, key):
 def test_unread_transforms_files_in_the_same_folder_are_reported(scan):
     write_images(scan, NAMES)
     write(scan / "transforms_train.json", [frame(0, colmap_im_id=1)])
-    assert not transforms.read_transforms(scan).notes
+    assert not transforms.read_transforms(scan).findings
     (scan / "transforms_val.json").write_text("{}")
-    (note,) = transforms.read_transforms(scan).notes
-    assert note == "transforms_train.json is read; transforms_val.json beside it is not."
+    (finding,) = transforms.read_transforms(scan).findings
+    assert finding == "transforms_train.json is read; transforms_val.json in the same folder is not."
     (scan / "transforms_test.json").write_text("{}")
-    (note,) = transforms.read_transforms(scan).notes
+    (finding,) = transforms.read_transforms(scan).findings
     assert (
-        note == "transforms_train.json is read; transforms_test.json, transforms_val.json beside it are not."
+        finding == "transforms_train.json is read; transforms_test.json, transforms_val.json in the same "
+        "folder are not."
     )
-    assert note.code == "capture.part"
+    assert finding.code == "capture.part"
     write(scan / "transforms.json", [frame(0, colmap_im_id=1)])
-    assert not transforms.read_transforms(scan).notes
+    assert not transforms.read_transforms(scan).findings
 
 
 def test_non_camera_entries_are_returned_by_image(scan):
@@ -393,15 +394,3 @@ def test_non_camera_entries_are_returned_by_image(scan):
     assert transforms.transforms_of(scan / "none") is None
     moved = write_images(scan / "else", ["a.png"])
     assert list(transforms.transforms_of(scan, scan / "else").frames) == moved
-
-
-def test_referenced_files_must_be_inside_the_folder(scan):
-    file = transforms.TransformsFile(scan / "transforms.json", {}, {})
-    (scan / "maps").mkdir()
-    inside = scan / "maps" / "p.ply"
-    inside.write_text("x")
-    (scan.parent / "outside.ply").write_text("x")
-    assert transforms.named_in_transforms(file, "maps\\p.ply") == inside.resolve()
-    for name in ("../outside.ply", "maps", "none.ply", None, 3, "a\0b", str(scan.parent / "outside.ply")):
-        assert transforms.named_in_transforms(file, name) is None
-    assert transforms.named_in_transforms(None, "maps/p.ply") is None

@@ -8,12 +8,27 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.reading import PairInputs
-from geodiff_plugin.jobs.records import JobLog, PairRun
-from geodiff_plugin.messages import Message
+from geodiff_plugin.jobs.records import JobLog, PairInputs, PairRun
 from geodiff_plugin.result.output import MetricDepthOutput
-from geodiff_plugin.types import Indicators, PoseReport, Rig, StepReport, Verdict
+from geodiff_plugin.trust import (
+    KINDS,
+    Epipolar,
+    FactSheet,
+    KnownPoints,
+    MatchedFraction,
+    PoseUncertainty,
+    Verdict,
+)
+from geodiff_plugin.trust.epipolar import Residuals
+from geodiff_plugin.trust.known_points import Points
+from geodiff_plugin.trust.matched_fraction import Matched
+from geodiff_plugin.trust.pose_uncertainty import Uncertainty
+from geodiff_plugin.trust.prior_correlation import Correlation, PriorCorrelation
+from geodiff_plugin.trust.rolling_shutter import RollingShutter, Shear
+from geodiff_plugin.types import PoseReport, Rig, StepReport
+from tests.views import made_rig
 
 #: ``(width, height)`` of the left image and of both right ones.
 SIZES = ((50, 36), (54, 40), (44, 34))
@@ -22,12 +37,22 @@ K_RIGHTS = (
     np.array([[66.0, 0, 27.4], [0, 63.0, 20.3], [0, 0, 1]]),
     np.array([[48.0, 0, 20.1], [0, 52.0, 14.6], [0, 0, 1]]),
 )
-WARNED = Message("calibration.as-taken", "The pictures are as taken.")
-NOTED = Message("camera.filled-in", "cy is assumed to be the middle.")
-REASON = Message("pose.inverse", "The inverse pose fits.")
-REMARK = Message("points.outside", "3 points are outside.")
-ASSUMED = Message("camera.filled-in", "fy is assumed to be fx.")
-OF_CALL = Message("capture.scale", "The scale is uncertain.")
+WARNED = Finding("calibration.unrectified", "The images are unrectified.")
+REASON = Finding(KINDS["depth.inverted-order"], "The inverse pose fits.")
+REMARK = Finding(KINDS["points.few"], "Only 2 points are known.")
+ASSUMED = Finding("camera.assumed-intrinsics", "fy is assumed to be fx.")
+OF_CALL = Finding("capture.scale", "The scale is uncertain.")
+#: Facts of a few checks.
+FACTS = FactSheet(
+    {
+        MatchedFraction: Matched(0.43, 0.61, 0.77),
+        PriorCorrelation: Correlation(0.87),
+        KnownPoints: Points(123, 4, 0.37, None, None),
+        Epipolar: Residuals("refined", (2.9, 3.1), (0.8, 1.7), 0.0, 1.0, False, None, None),
+        PoseUncertainty: Uncertainty(0.04, 0.0, True),
+        RollingShutter: Shear(0.02, SIZES[0][0]),
+    }
+)
 
 
 def pose(angles_deg: tuple[float, float, float], centre: tuple[float, float, float]) -> np.ndarray:
@@ -71,8 +96,7 @@ def output(**changes) -> MetricDepthOutput:
     confidence[2:4] = 0.0
     visible = rng.random(shape) < 0.7
     error = np.where(visible, rng.uniform(0.05, 0.4, shape), 0.9).astype(np.float32)
-    found = Indicators(confidence=0.61, matched=0.43, rank_correlation=0.87, points=123, epipolar_px=1.7)
-    verdict = Verdict("not trusted", (REASON,), (REMARK,), replace(found, scale_spread=0.04, shear=0.02))
+    verdict = Verdict("not trusted", (REASON, REMARK), FACTS)
     steps = [
         StepReport(
             step=number,
@@ -101,12 +125,11 @@ def output(**changes) -> MetricDepthOutput:
         K=K_LEFT[None],
         history=steps,
         poses=[
-            PoseReport("refined", POSES, REFINED, (2.9, 3.1), (0.8, 0.9), (311.0, 287.0), bars=0.02),
+            PoseReport("refined", POSES, REFINED, (2.9, 3.1), (0.8, 0.9), (311.0, 287.0), depth_spread=0.02),
         ],
         extras={"normals": as_map(depth_m)[..., 0].repeat(3, 0).transpose(1, 2, 0)[None]},
         verdicts=[verdict],
-        warnings=[OF_CALL],
-        assumed=[ASSUMED],
+        findings=[REASON, REMARK, OF_CALL, ASSUMED],
     )
     return MetricDepthOutput(**dict(made) | changes)
 
@@ -114,9 +137,9 @@ def output(**changes) -> MetricDepthOutput:
 def run(made: MetricDepthOutput | None = None, **options) -> PairRun:
     """The run of such a pair with the options of its command."""
     given, rng = guidance(), np.random.default_rng(11)
-    rig = replace(given.rigs[0], size_left=SIZES[0], size_right=SIZES[1], source="calib.txt")
+    rig = replace(given.rigs[0].sized(*SIZES[:2]), source="calib.txt")
     width, height = SIZES[0]
-    inputs = PairInputs(rng.random((height, width, 3), np.float32), rig, given, notes=(NOTED,))
+    inputs = PairInputs(rng.random((height, width, 3), np.float32), rig, given)
     log = JobLog({"calibration": 0.1251, "guided call": 2.5004}, [WARNED])
     words = {"left": Path("a/left.png"), "right": Path("a/right.png"), "view": (Path("b/third.png"),)}
     prior = {"name": "bundled", "pipeline": "P", "scheduler": "S", "device": "cpu", "dtype": "float32"}
@@ -124,4 +147,4 @@ def run(made: MetricDepthOutput | None = None, **options) -> PairRun:
 
 
 def rig_of(E: np.ndarray) -> Rig:
-    return Rig(K_LEFT, K_RIGHTS[0], E)
+    return made_rig(K_LEFT, K_RIGHTS[0], E)

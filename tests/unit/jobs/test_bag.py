@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.jobs import bag
 from geodiff_plugin.jobs.bag import depth_bag
 from geodiff_plugin.jobs.options import DepthOptions
@@ -25,21 +25,22 @@ def run(tmp_path, monkeypatch):
         asked.cameras = (path, topics)
         return asked.texts, "optical"
 
-    def start_many(options, tell):
+    def start_many(options, notify):
         asked.started = options
         return [PairRef(f"00000{n}", options.left, None, frame=n) for n in range(3)]
 
-    def depth_pairs(options, refs, *, tell, progress):
-        asked.pairs = (options, refs, tell, progress)
+    def depth_pairs(options, refs, *, notify, progress):
+        asked.pairs = (options, refs, notify, progress)
         for n in (0, 2):
             folder = options.out / refs[n].name
             folder.mkdir(parents=True, exist_ok=True)
             np.save(folder / "depth.npy", made_runs.depth_map() + n)
-            np.save(folder / "depth_into.npy", np.full((24, 28), 1.5 + n, np.float32))
+            np.save(folder / "depth_reprojected.npy", np.full((24, 28), 1.5 + n, np.float32))
             (folder / "report.json").write_text(f'{{"K": [{(made_runs.K_LEFT + n).tolist()}]}}')
         confidence = np.ones((36, 50), np.float32)
         confidence[4] = 0.0
         np.save(options.out / "000002/confidence.npy", confidence)
+        np.save(options.out / "000002/sigma.npy", 0.25 * confidence)
         return ["row"] * 3
 
     def write_depth_bag(path, frames, frame_id, encoding):
@@ -61,8 +62,8 @@ def run(tmp_path, monkeypatch):
 
 
 def test_every_finished_pair_is_an_image_with_its_time_and_camera(run, tmp_path):
-    told = []
-    result = depth_bag(replace(run.options, encoding="32FC1"), tell=told.append, progress=True)
+    reported = []
+    result = depth_bag(replace(run.options, encoding="32FC1"), notify=reported.append, progress=True)
     frames_folder = tmp_path / "depth-frames"
     assert (result.path, result.frames, result.images, result.rows) == (
         tmp_path / "depth.bag",
@@ -80,11 +81,15 @@ def test_every_finished_pair_is_an_image_with_its_time_and_camera(run, tmp_path)
     np.testing.assert_array_equal(frames[1][1], expected)
     for n, frame in zip((0, 2), frames, strict=True):
         np.testing.assert_allclose(frame[2], made_runs.K_LEFT + n)
-    options, _, tell, progress = run.pairs
+    assert frames[0].sigma_m is None, "of a preset without confidence"
+    np.testing.assert_array_equal(frames[1].sigma_m, np.load(frames_folder / "000002/sigma.npy"))
+    options, _, notify, progress = run.pairs
     calib = tuple(frames_folder / f"camera_info_{n}.yaml" for n in range(2))
     assert options == replace(run.options, encoding="32FC1", out=frames_folder, calib=calib) == run.started
     assert (
-        [file.read_text() for file in calib] == list(run.texts) and tell == told.append and progress is True
+        [file.read_text() for file in calib] == list(run.texts)
+        and notify == reported.append
+        and progress is True
     )
     before = [file.stat().st_mtime_ns for file in calib]
     run.texts = ("left camera", "another")
@@ -115,21 +120,22 @@ def test_cameras_that_are_given_take_the_place_of_those_of_the_bag(run, given):
 
 def test_images_of_another_camera_have_its_frame_and_its_k(run, tmp_path):
     path = target(tmp_path)
-    depth_bag(replace(run.options, into=path))
+    depth_bag(replace(run.options, reproject=path))
     _, frames, frame_id, _ = run.written
-    assert frame_id == "into"
+    assert frame_id == "reprojected"
     for n, frame in zip((0, 2), frames, strict=True):
         np.testing.assert_array_equal(frame[1], np.full((24, 28), 1.5 + n))
+        assert frame.sigma_m is None, "it belongs to the left camera"
         np.testing.assert_allclose(frame[2], [[30, 0, 13], [0, 32, 11], [0, 0, 1]])
 
 
 def test_a_bag_is_written_as_one_new_bag(run, tmp_path, monkeypatch):
     for more, said in (
-        ({"out": tmp_path / "depth.png"}, "--out must be a file that ends in"),
-        ({"out": tmp_path}, "--out must be a file that ends in"),
+        ({"out": tmp_path / "depth.png"}, "--out must be a file name ending in"),
+        ({"out": tmp_path}, "--out must be a file name ending in"),
         ({"shard": "0/2"}, "--shard cannot be used with a bag"),
         ({"engine": "ray"}, "--engine cannot be used with a bag"),
-        ({"topic_left": None}, "--left is missing"),
+        ({"topic_left": None}, "--left-topic is missing"),
     ):
         with pytest.raises(InputError, match=said):
             depth_bag(replace(run.options, **more))

@@ -1,16 +1,18 @@
 """When a finished pair is that of other options: every option changes its key, or is listed with a reason."""
 
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.config import Affects, affected
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.jobs import many
 from geodiff_plugin.jobs.finished import changed_options, file_digests, finished_row, row_of
+from geodiff_plugin.jobs.notices import silent
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.options import flag_of
+from geodiff_plugin.settings import Affects, names_affecting, settings_of
 
 #: Options that do not change a result, and why.
 NO_DIFFERENCE = {
@@ -19,15 +21,15 @@ NO_DIFFERENCE = {
     "quiet": "what is printed",
     "json": "what is printed",
     "strict": "what a finished result is worth, judged again by each run",
-    "steady": "added to finished results by the run that asks for it",
+    "temporal_smoothing": "added to finished results by the run that asks for it",
     "shard": "which process makes it",
     "engine": "which process makes it",
     "layout": "another kind of folder",
     "workers": "which process makes it",
     "gpus": "which process makes it",
     "device": "equal within rounding",
-    "graphs": "equal within rounding",
-    "no_kernels": "equal within rounding",
+    "cuda_graphs": "equal within rounding",
+    "no_triton": "equal within rounding",
     "encoding": "of the bag that is written from the results",
 }
 FIELDS = {field.name: field for field in fields(DepthOptions)}
@@ -55,11 +57,11 @@ def test_every_option_makes_another_result_or_is_listed_with_a_reason(name):
         if name in NO_DIFFERENCE:
             assert not changes
         else:
-            assert changes and flag_of(FIELDS[name]) in " ".join(changes)
+            assert changes and settings_of(DepthOptions)[name].flag in " ".join(changes)
 
 
 def test_the_list_of_options_without_a_difference_is_that_of_the_package():
-    assert set(NO_DIFFERENCE) == {name for name in FIELDS if affected(FIELDS[name]) is Affects.NOTHING}
+    assert set(NO_DIFFERENCE) == set(names_affecting(DepthOptions, Affects.NOTHING))
 
 
 FILES = {
@@ -68,11 +70,13 @@ FILES = {
     "k": (),
     "e": (),
     "k_right": (),
+    "mask": (),
+    "right_mask": (),
     "prior_map": (),
     "points": (),
     "disparity": (),
     "points_confidence": (),
-    "into": (),
+    "reproject": (),
     "calib": ("one", "two"),
     "view": ("one", "two"),
     "view_k": ("one", "two"),
@@ -121,22 +125,25 @@ def test_a_folder_of_arrays_is_a_calibration(tmp_path):
 
     for name, value in {"M1": np.eye(3), "M2": np.eye(3), "R": np.eye(3), "T": np.ones(3)}.items():
         np.save(tmp_path / f"{name}.npy", value)
-    check_files(DepthOptions(left=Path("a"), calib=(tmp_path,)), photographs=False)
+    check_files(DepthOptions(left=Path("a"), calib=(tmp_path,)), images=False)
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="the folder"):
-        check_files(DepthOptions(left=Path("a"), calib=(tmp_path / "empty",)), photographs=False)
+        check_files(DepthOptions(left=Path("a"), calib=(tmp_path / "empty",)), images=False)
 
 
 REPORT = {
     "depth": {"min_m": 1.25, "median_m": 2.5, "max_m": 3.75},
-    "verdict": {"status": "trusted", "indicators": {"confidence": 0.875}, "reasons": []},
+    "verdict": {"status": "trusted", "facts": {"matched_fraction": {"confidence": 0.875}}, "reasons": []},
     "seconds": {"calibration": 0.25, "guided call": 1.5, "write": 0.0625},
-    "warnings": ["One.", "Two."],
-    "messages": [{"code": "pose.refined"}, {"code": "camera.filled-in"}],
+    "findings": [
+        {"code": "pose.refined", "severity": "warning", "text": "One."},
+        {"code": "points.few", "severity": "remark", "text": "Two."},
+        {"code": "camera.assumed-intrinsics", "severity": "assumption", "text": "Three."},
+    ],
 }
 
 
-def test_the_row_of_a_pair_says_what_its_report_says():
+def test_the_row_of_a_pair_matches_its_report():
     assert row_of(REPORT) == {
         "near_m": 1.25,
         "median_m": 2.5,
@@ -146,13 +153,13 @@ def test_the_row_of_a_pair_says_what_its_report_says():
         "seconds": 1.812,  # to the millisecond
         "message": "One. Two.",
         "reasons": "",
-        "codes": "pose.refined camera.filled-in",
+        "codes": "pose.refined points.few camera.assumed-intrinsics",
     }
     doubted = REPORT["verdict"] | {"status": "not trusted", "reasons": ["E is wrong.", "So is K."]}
-    row = row_of(REPORT | {"verdict": doubted, "warnings": [], "messages": []})
+    row = row_of(REPORT | {"verdict": doubted, "findings": []})
     assert row["confidence"] is row["message"] is row["codes"] is None
     assert (row["verdict"], row["reasons"]) == ("not trusted", "E is wrong. So is K.")
-    assert row_of({name: REPORT[name] for name in REPORT if name != "messages"})["codes"] is None
+    assert row_of({name: REPORT[name] for name in REPORT if name != "findings"})["codes"] is None
 
 
 def test_every_difference_of_options_and_files_is_named_at_once(tmp_path):
@@ -185,3 +192,75 @@ def test_every_difference_of_options_and_files_is_named_at_once(tmp_path):
     ):
         assert words in said
     assert str(tmp_path / "right") not in said and "seed" not in said
+
+
+@pytest.fixture
+def options(tmp_path) -> DepthOptions:
+    """Of a pair of files, whose result with its report lies in ``out``."""
+    for name in ("left", "right", "K", "E"):
+        (tmp_path / name).write_text(name)
+    paths = {name: tmp_path / name for name in ("left", "right", "out")}
+    options = DepthOptions(**paths, k=tmp_path / "K", e=tmp_path / "E")
+    options.out.mkdir()
+    (options.out / "depth.npy").write_text("depth")
+    write_report(options)
+    return options
+
+
+def report_for(options: DepthOptions) -> dict:
+    return {
+        "arguments": options.as_json(),
+        "depth": {"min_m": 1.0, "median_m": 2.0, "max_m": 3.0},
+        "verdict": {"status": "trusted", "facts": {"matched_fraction": {"confidence": 0.8}}, "reasons": []},
+        "seconds": {"calibration": 0.25, "guided": 1.5},
+        "findings": [{"code": "camera.assumed-intrinsics", "severity": "assumption", "text": "fy is fx."}],
+        "files": {"names": ["depth.npy", "report.json"]},
+        "pair": {"sha256": file_digests(options)},
+    }
+
+
+def write_report(options: DepthOptions, **changes) -> None:
+    (options.out / "report.json").write_text(json.dumps(report_for(options) | changes))
+
+
+def test_a_whole_folder_of_the_same_options_and_files_is_finished(options):
+    row = finished_row(options)
+    assert row == row_of(report_for(options))
+    assert (row["near_m"], row["confidence"], row["seconds"], row["codes"]) == (
+        1.0,
+        0.8,
+        1.75,
+        "camera.assumed-intrinsics",
+    )
+    assert finished_row(replace(options, quiet=True, strict=True, device="cpu")) == row
+    write_report(options, pair={})  # by a version that did not know them
+    assert finished_row(options) == row
+
+
+@pytest.mark.parametrize("name", ["depth.npy", "report.json"])
+@pytest.mark.parametrize("way", [lambda path: path.unlink(), lambda path: path.write_text("")])
+def test_a_folder_without_one_of_its_files_or_with_an_empty_one_is_not(name, way, options):
+    way(options.out / name)
+    assert finished_row(options) is None
+
+
+def test_a_report_of_something_else_is_none(options):
+    for text in ("{}", "[1]", '{"arguments": {}}', json.dumps(report_for(options) | {"files": None})):
+        (options.out / "report.json").write_text(text)
+        assert finished_row(options) is None
+
+
+def test_other_options_and_other_contents_are_rejected_with_what_differs(options):
+    with pytest.raises(InputError, match="made with --seed 0 instead of 7"):
+        finished_row(replace(options, seed=7))
+    Path(options.right).write_text("another")
+    with pytest.raises(InputError, match=r"made before \S*right changed"):
+        finished_row(options)
+
+
+def test_a_folder_takes_precedence_over_the_journal(options):
+    there = row_of(report_for(options))
+    row = many._final({"key": "a", "near_m": 9.0, "verdict": "not trusted"}, there, options, silent)
+    assert (row["pair"], row["result"], row["near_m"], row["verdict"]) == ("a", "kept", 1.0, "trusted")
+    row = many._final({"key": "a", **there}, None, options, silent)
+    assert (row["result"], row["near_m"]) == ("done", 1.0)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint, shards_beside
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint, shard_files
 
 
 def test_a_fingerprint_changes_with_every_part_and_with_nothing_else(tmp_path):
@@ -75,7 +75,7 @@ def test_shards_divide_the_items_evenly_and_in_order(monkeypatch):
     ("count", "gpus", "said", "processes"),
     [(6, 4, None, 4), (3, 4, None, 3), (3, 0, None, 1), (1, 4, None, 1), (6, 4, "2", 2)],
 )
-def test_a_machine_has_a_process_for_each_gpu_unless_torchrun_says_how_many(
+def test_a_machine_has_a_process_per_gpu_unless_torchrun_sets_the_number(
     monkeypatch, count, gpus, said, processes
 ):
     monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
@@ -84,7 +84,7 @@ def test_a_machine_has_a_process_for_each_gpu_unless_torchrun_says_how_many(
     assert Shard(0, count).processes_here(gpus) == processes
 
 
-def test_a_shard_is_told_by_the_launcher_or_typed(monkeypatch):
+def test_a_shard_is_set_by_the_launcher_or_given(monkeypatch):
     monkeypatch.setenv("RANK", "3")
     monkeypatch.setenv("WORLD_SIZE", "5")
     assert Shard.of(None) == Shard(3, 5) and Shard.of("1/9") == Shard(1, 9)
@@ -100,14 +100,14 @@ def test_files_of_shards_are_found_and_sorted_as_numbers(tmp_path):
     names = ["job.10-of-12.jsonl", "job.2-of-12.jsonl", "job.1-of-2.jsonl", "job.jsonl", "job.1-of-2.csv"]
     for name in [*names, "other.0-of-2.jsonl", "xjob.0-of-2.jsonl"]:
         (tmp_path / name).write_text("")
-    found = shards_beside(tmp_path / "job.jsonl")
+    found = shard_files(tmp_path / "job.jsonl")
     assert list(found) == [Shard(1, 2), Shard(2, 12), Shard(10, 12)]
     assert [path.name for path in found.values()] == [
         "job.1-of-2.jsonl",
         "job.2-of-12.jsonl",
         "job.10-of-12.jsonl",
     ]
-    assert shards_beside(tmp_path / "none/job.jsonl") == {}
+    assert shard_files(tmp_path / "none/job.jsonl") == {}
 
 
 def test_an_item_is_named_by_its_name_or_its_key():
@@ -159,7 +159,7 @@ def test_shards_read_each_others_records_and_write_their_own(tmp_path):
         with Journal(path, Shard(1, 2)) as second:
             assert second.get(Item("w")) and second.get(Item("f"))
             assert second.path.name == "job.1-of-2.jsonl"
-        with pytest.raises(InputError, match=f"Another run works in {tmp_path}"):
+        with pytest.raises(InputError, match=f"Another run is using {tmp_path}"):
             Journal(path, Shard(0, 2))
     with Journal(path) as again:
         assert again.get(Item("f")) and again.path == path

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.cameras import Camera, Distortion
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.formats.layouts import CaptureFrame
 from geodiff_plugin.jobs.lengths import (
@@ -20,7 +21,6 @@ from geodiff_plugin.jobs.lengths import (
 )
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.pose.multiview import SolvedCapture
-from geodiff_plugin.types import Distortion
 from tests.unit.jobs.made_runs import pose
 
 SIZE = (60, 44)
@@ -48,15 +48,22 @@ def confidence_of(name: str) -> np.ndarray:
     return np.clip(0.3 + 0.01 * np.arange(width)[None] + 0.0 * np.arange(height)[:, None], 0, 1)
 
 
+def sigma_of(name: str) -> np.ndarray:
+    """Smaller where the confidence is higher, but not what follows from the confidence alone."""
+    return depth_of(name) * 0.05 * (1.2 - confidence_of(name))
+
+
 def maps_of(name: str):
-    return depth_of(name), confidence_of(name)
+    return depth_of(name), confidence_of(name), sigma_of(name)
 
 
 @pytest.fixture
 def capture() -> Capture:
     lens = Distortion("opencv", np.array([-0.15, 0.02, 0.0, 0.0]))
     frames = [
-        CaptureFrame(f"f{n}", Path(f"f{n}.png"), E=ES[n], size=SIZE, K=K_GIVEN, lens=lens if n == 2 else None)
+        CaptureFrame(
+            f"f{n}", Path(f"f{n}.png"), E=ES[n], camera=Camera(K_GIVEN, SIZE, lens if n == 2 else None)
+        )
         for n in range(3)
     ]
     made = Capture(frames, "test", None, ())
@@ -75,10 +82,7 @@ def point(name: str, x: int, y: int) -> np.ndarray:
 
 
 def relative_spread(name: str, x: int, y: int) -> float:
-    """Of a normal error that is within 10 % with the probability of the confidence."""
-    from statistics import NormalDist
-
-    return 0.1 / NormalDist().inv_cdf((1 + confidence_of(name)[y, x]) / 2)
+    return sigma_of(name)[y, x] / depth_of(name)[y, x]
 
 
 def length_of(name: str, a, b) -> tuple[float, float]:
@@ -113,13 +117,13 @@ def test_a_length_that_is_measured_to_no_better_than_a_tenth_is_doubted(capture,
     scale = known_scale(capture, options(known_length=f"f0:{x1},{y1},{x2},{y2},2"), maps_of)
     assert (scale.doubt is not None) == doubted
     if doubted:
-        assert scale.doubt.code == "capture.length" and scale.doubt.forbids_trust
-        assert f"in f0 is measured to {100 * spread / length:.0f} % only" in scale.doubt
+        assert scale.doubt.code == "capture.length" and scale.doubt.is_reason
+        assert f"in f0 is known to {100 * spread / length:.0f} %" in scale.doubt
 
 
 def test_without_a_confidence_the_prior_alone_measures(capture):
     scale = known_scale(capture, options(known_length="f0:40,3,58,40,2"), lambda name: (depth_of(name), None))
-    assert scale.spread == 1.0 and "by nothing but the prior" in scale.doubt
+    assert scale.spread == 1.0 and "known only by the prior" in scale.doubt
 
 
 def test_a_known_length_of_a_distorted_frame_is_taken_where_its_ends_lie_without_distortion(capture):
@@ -149,6 +153,7 @@ def test_lengths_are_measured_in_the_finished_maps_with_both_spreads(capture, tm
         (tmp_path / f"f{n}").mkdir()
         np.save(tmp_path / f"f{n}/depth.npy", depth_of(f"f{n}"))
         np.save(tmp_path / f"f{n}/confidence.npy", confidence_of(f"f{n}"))
+        np.save(tmp_path / f"f{n}/sigma.npy", sigma_of(f"f{n}"))
     typed = options(measure=("f0:40,3,58,40", "f1:10,7,52,33"))
     records = measure(capture, spans_to_measure(capture, typed), tmp_path, ["f1"], 0.07)
     for record, name, ends in zip(records, ("f0", "f1"), ((40, 3, 58, 40), (10, 7, 52, 33)), strict=True):
@@ -187,7 +192,7 @@ def test_lengths_are_measured_in_the_finished_maps_with_both_spreads(capture, tm
         {"measure": ("f1:1,2,3,4",), "frames": "f0,f2"},
     ],
 )
-def test_lengths_that_a_capture_cannot_have_are_refused(capture, typed):
+def test_lengths_that_a_capture_cannot_have_are_rejected(capture, typed):
     with pytest.raises(InputError, match="--known-length|--distance|--measure|a frame"):
         check_lengths(capture, options(**typed))
 
@@ -203,12 +208,12 @@ def test_lengths_that_a_capture_cannot_have_are_refused(capture, typed):
         {},
     ],
 )
-def test_lengths_up_to_the_edges_of_a_picture_are_taken(capture, typed):
+def test_lengths_up_to_the_edges_of_an_image_are_taken(capture, typed):
     check_lengths(capture, options(**typed))
 
 
-def test_pixels_that_leave_the_picture_without_its_distortion_are_refused(capture):
-    with pytest.raises(InputError, match="without lens distortion"):
+def test_pixels_outside_the_undistorted_image_are_rejected(capture):
+    with pytest.raises(InputError, match="in the undistorted image"):
         check_lengths(capture, options(measure=("f2:0,0,30,20",)))
 
 
@@ -216,7 +221,7 @@ def test_two_frames_at_one_place_and_one_place_twice_set_no_scale(capture):
     E = ES.copy()
     E[1, :3, 3] = E[0, :3, 3]
     capture.solved = SolvedCapture("solved", E, None, KS, np.ones(3, bool), np.zeros((0, 3)), ())
-    with pytest.raises(InputError, match="of two frames with different positions"):
+    with pytest.raises(InputError, match="between frames with different camera positions"):
         known_scale(capture, options(distance="f0,f1,1"), maps_of)
-    with pytest.raises(InputError, match="between two different places"):  # in one pixel of the map
+    with pytest.raises(InputError, match="between two different points"):  # in one pixel of the map
         known_scale(capture, options(known_length="f0:10,10,10.2,10,1"), maps_of)

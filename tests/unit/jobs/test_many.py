@@ -7,12 +7,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.jobs import many
-from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard
+from geodiff_plugin.jobs.journal import BROKEN, Done, Item, Journal, Shard
+from geodiff_plugin.jobs.notices import silent
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import COLUMNS, PairRef
-from geodiff_plugin.jobs.telling import silent
+from geodiff_plugin.jobs.records import JobLog, ReadPair
 
 ROW = {
     "near_m": 1.0,
@@ -31,25 +33,25 @@ def options(**more) -> DepthOptions:
     return DepthOptions(**{"left": Path("l"), "right": Path("r"), "out": Path("out"), "device": "cpu"} | more)
 
 
-def test_a_row_says_what_became_of_its_pair():
-    told = []
-    done = many._final({"key": "a", **ROW}, None, options(), told.append)
+def test_a_row_states_the_result_of_its_pair():
+    reported = []
+    done = many._final({"key": "a", **ROW}, None, options(), reported.append)
     expected = {name: ROW.get(name) for name in COLUMNS} | {"pair": "a"}
     assert done == expected | {"result": "done"} and list(done) == list(COLUMNS)
-    there = many._final({"key": "a"}, ROW, options(), told.append)
-    assert there == expected | {"result": "there"}
+    there = many._final({"key": "a"}, ROW, options(), reported.append)
+    assert there == expected | {"result": "kept"}
     broken = {"key": "b", "status": BROKEN, "error": "torn"}
     empty = dict.fromkeys(COLUMNS)
     failed = empty | {"pair": "b", "result": "failed", "message": "torn"}
-    assert many._final(broken, None, options(), told.append) == failed
-    assert told == []
+    assert many._final(broken, None, options(), reported.append) == failed
+    assert reported == []
     doubted = ROW | {"verdict": "not trusted", "reasons": "E is wrong."}
-    assert many._final({"key": "c", **doubted}, None, options(), told.append)["result"] == "done"
-    assert many._final({"key": "c", **ROW}, None, options(strict=True), told.append)["result"] == "done"
-    row = many._final({"key": "c", **doubted}, None, options(strict=True), told.append)
+    assert many._final({"key": "c", **doubted}, None, options(), reported.append)["result"] == "done"
+    assert many._final({"key": "c", **ROW}, None, options(strict=True), reported.append)["result"] == "done"
+    row = many._final({"key": "c", **doubted}, None, options(strict=True), reported.append)
     reason = f"The depth in {Path('out/c')} is not trusted: E is wrong."
     assert row == empty | {"pair": "c", "result": "failed", "message": reason, "codes": "pose.refined"}
-    assert told == [f"geodiff: c: {reason}"]
+    assert reported == [f"geodiff: c: {reason}"]
 
 
 @pytest.mark.parametrize(
@@ -71,7 +73,7 @@ def test_a_row_says_what_became_of_its_pair():
         ("cpu", 9, 16, 1, 0),
     ],
 )
-def test_beside_a_gpu_the_cores_that_its_stages_leave_write(
+def test_with_a_gpu_the_cores_that_its_stages_leave_write(
     monkeypatch, device, pairs, cores, processes, count
 ):
     monkeypatch.setattr(many, "available_cores", lambda: cores)
@@ -103,17 +105,17 @@ def test_pairs_count_as_finished_by_their_folder_alone(tmp_path, monkeypatch):
     with Journal(tmp_path / "job.jsonl") as journal:
         journal.put(a, {"near_m": 9.0})
         journal.put(c, {"near_m": 9.0})
-        there = many._rows_there([a, b, c], options(), journal)
+        there = many._finished_rows([a, b, c], options(), journal)
         assert there == {"a": ROW, "b": ROW}
         assert journal.get(a)["near_m"] == 9.0 and journal.get(b)["near_m"] == 1.0
         assert journal.get(c) is None, "its folder is gone"
         assert [own.out for own in asked] == [Path("out/a"), Path("out/b"), Path("out/c")]
         assert [own.left.name for own in asked] == ["a.png", "b.png", "c.png"]
-        assert many._rows_there([a, b], options(overwrite=True), journal) == {}
+        assert many._finished_rows([a, b], options(overwrite=True), journal) == {}
         assert journal.get(a) is journal.get(b) is None and len(asked) == 3
 
 
-def test_one_baseline_for_all_pairs_of_a_model_is_refused(monkeypatch):
+def test_one_baseline_for_all_pairs_of_a_model_is_rejected(monkeypatch):
     asked = []
 
     def has_pose_per_image(calib):
@@ -122,15 +124,15 @@ def test_one_baseline_for_all_pairs_of_a_model_is_refused(monkeypatch):
 
     monkeypatch.setattr(many, "has_pose_per_image", has_pose_per_image)
     refs = [PairRef(name, Path(name), Path("r"), Path("model")) for name in "ab"]
-    with pytest.raises(InputError, match="every pair of model has a baseline of its own"):
-        many._refuse_one_length(options(baseline=0.1), refs)
-    many._refuse_one_length(options(), refs)
-    many._refuse_one_length(options(baseline=0.1), refs[:1])
+    with pytest.raises(InputError, match="every pair of model has its own baseline"):
+        many._raise_one_length(options(baseline=0.1), refs)
+    many._raise_one_length(options(), refs)
+    many._raise_one_length(options(baseline=0.1), refs[:1])
     assert asked == [Path("model")]
     plain = [PairRef(name, Path(name), Path("r")) for name in "ab"]
-    many._refuse_one_length(options(baseline=0.1), plain)
-    many._refuse_one_length(options(baseline=0.1, calib=(Path("one"),)), plain)
-    many._refuse_one_length(options(baseline=0.1, calib=(Path("one"), Path("two"))), plain)
+    many._raise_one_length(options(baseline=0.1), plain)
+    many._raise_one_length(options(baseline=0.1, calib=(Path("one"),)), plain)
+    many._raise_one_length(options(baseline=0.1, calib=(Path("one"), Path("two"))), plain)
     assert asked[1:] == [Path("one"), (Path("one"), Path("two"))]
 
 
@@ -151,35 +153,47 @@ class Folder:
 @pytest.fixture
 def stages(monkeypatch):
     """The stages, with what they call noted."""
-    asked = SimpleNamespace(started=[], read=[], prior=[], run=[], written=[], told=[])
+    asked = SimpleNamespace(started=[], read=[], prior=[], run=[], written=[], reported=[])
+    found = [
+        Finding("camera.assumed-intrinsics", "cy is assumed."),
+        Finding("calibration.unrectified", "As taken."),
+    ]
     guidance = SimpleNamespace(
-        evidence_store=None, prepare=lambda lefts: asked.run.append(("prepare", lefts))
+        findings=found,
+        evidence_store=None,
+        prefetch=lambda left, device: asked.run.append((left, device)),
     )
-    inputs = SimpleNamespace(guidance=guidance, left=torch.zeros(3, 40, 50), notes=("a note",))
+    inputs = SimpleNamespace(guidance=guidance, left=torch.zeros(3, 40, 50))
     pipe = SimpleNamespace(_execution_device=torch.device("cpu"))
 
-    def start_pair(own, photographs):
-        asked.started.append((own, photographs))
+    def start_pair(own, images):
+        asked.started.append((own, images))
         return Folder(own.out)
 
-    def read_pair(own, views):
-        asked.read.append((own, views))
-        return inputs
+    class Reader:
+        def __init__(self, _):
+            self.closed = False
 
-    def prior_of_options(own, device, tell):
-        asked.prior.append((own, device, tell))
+        def read(self, ref, own):
+            asked.read.append((ref.name, own))
+            return ReadPair(own, inputs, JobLog({"calibration": 1.0}))
+
+        def close(self):
+            self.closed = True
+
+    def prior_of_options(own, device, notify):
+        asked.prior.append((own, device, notify))
         return pipe
 
-    def run_pair(*given):
+    def run_read_pair(*given):
         asked.run.append(given)
         return "run"
 
     monkeypatch.setattr(many, "start_pair", start_pair)
-    monkeypatch.setattr(many, "read_pair", read_pair)
+    monkeypatch.setattr(many, "PairReader", Reader)
     monkeypatch.setattr(many, "prior_of_options", prior_of_options)
-    monkeypatch.setattr(many, "run_pair", run_pair)
+    monkeypatch.setattr(many, "run_read_pair", run_read_pair)
     monkeypatch.setattr(many, "write_row", lambda *given: asked.written.append(given) or dict(ROW))
-    monkeypatch.setattr(many, "file_digests", lambda own: {str(own.left): "digest"})
     asked.inputs, asked.pipe = inputs, pipe
     return asked
 
@@ -187,43 +201,42 @@ def stages(monkeypatch):
 @pytest.mark.parametrize("frame", [None, 4])
 def test_a_pair_goes_through_all_stages(stages, frame):
     cpu = torch.device("cpu")
-    line = many.Stages(options(seed=3), cpu, tell=stages.told.append)
-    line._views.of = lambda ref: f"views of {ref.name}"
+    line = many.Stages(options(seed=3), cpu, notify=stages.reported.append)
     item = Item("a", PairRef("a", Path("a.png"), Path("b.png"), frame=frame))
-    pair = line.read(item)
-    ((own, photographs),) = stages.started
-    assert (own.left, own.out, own.seed, photographs) == (Path("a.png"), Path("out/a"), 3, frame is None)
-    assert stages.read == [(own, "views of a")] and stages.told == ["a note"]
-    assert pair.entries == {"pair": {"name": "a", "frame": frame, "sha256": {"a.png": "digest"}}}
-    assert pair.folder.held == 1 and list(pair.log.seconds) == ["calibration"]
+    begun = line.read(item)
+    ((own, images),) = stages.started
+    assert (own.left, own.out, own.seed, images) == (Path("a.png"), Path("out/a"), 3, frame is None)
+    assert stages.read == [("a", own)] and stages.reported == ["cy is assumed."]
+    assert begun.folder.held == 1
 
-    assert line.evidence(pair) is pair
-    ((asked, device, tell),) = stages.prior
-    assert asked == options(seed=3) and device == cpu and tell == stages.told.append
-    name, lefts = stages.run.pop()
-    assert name == "prepare" and lefts.shape == (1, 3, 40, 50)
-    assert isinstance(stages.inputs.guidance.evidence_store, many.EvidenceStore)
-    assert list(pair.log.seconds) == ["calibration", "evidence"]
+    assert line.evidence(begun) is begun
+    ((asked, device, notify),) = stages.prior
+    assert asked == options(seed=3) and device == cpu and notify == stages.reported.append
+    assert stages.run == [(stages.inputs.left, cpu)]
+    stages.run.clear()
+    stages.inputs.guidance.evidence_store = "of the call"
+    assert list(begun.pair.log.seconds) == ["calibration", "evidence"]
 
-    assert line.guide(pair) is pair and pair.run == "run"
-    assert stages.run == [(stages.pipe, own, stages.inputs, pair.log)]
+    assert line.guide(begun) is begun and begun.run == "run"
+    assert stages.run == [(stages.pipe, begun.pair)]
     assert stages.inputs.guidance.evidence_store is None
-    assert line.write(pair) == ROW and stages.written == [(pair.folder, "run", pair.entries)]
+    assert line.write(begun) == ROW and stages.written == [(begun.folder, "run")]
     line.release(item)
     line.release(item)
-    assert pair.folder.held == 0
-    line.evidence(pair)
+    assert begun.folder.held == 0
+    line.evidence(begun)
     assert len(stages.prior) == 1, "the prior is loaded once"
     assert [getattr(stage, "threads", 1) for stage in line.all] == [1, 1, 1, 1]
     line.close()
+    assert line._reader.closed
 
 
 def test_on_a_gpu_the_networks_of_many_pairs_are_recorded_as_graphs(stages):
     line = many.Stages(options(), torch.device("cuda"), among=2)
     pair = line.read(items("a")[0])
     line.evidence(pair)
-    ((asked, _, tell),) = stages.prior
-    assert asked == options(graphs=True) and tell is None, "silence shows no bar of a download"
+    ((asked, _, notify),) = stages.prior
+    assert asked == options(cuda_graphs=True) and notify is None, "silence shows no bar of a download"
     line.close()
 
 
@@ -241,14 +254,14 @@ def test_processes_write_where_there_are_any(stages, monkeypatch):
         def close(self):
             calls.append("close")
 
-    monkeypatch.setattr(many, "SeparateProcesses", Processes)
+    monkeypatch.setattr(many, "WorkerProcesses", Processes)
     line = many.Stages(options(), torch.device("cpu"), "pipe", writers=2)
     assert line.all[3].threads == 2
     pair = line.read(items("a")[0])
     pair.run = "run"
     assert line.write(pair) == ROW
     line.close()
-    assert calls[0][1] == 2 and calls[1] == (many.write_row, "place of a", "run", pair.entries)
+    assert calls[0][1] == 2 and calls[1] == (many.write_row, "place of a", "run")
     assert calls[2] == "close" and stages.prior == []
 
 
@@ -269,7 +282,7 @@ def test_what_would_fail_every_pair_ends_the_run(stages, monkeypatch):
     pair.run = "run"
     for error, words in (
         (OSError(28, "No space left"), "The disk of --out is full"),
-        (many.ProcessEnded("A helper process has ended."), "has ended. Finished pairs stay"),
+        (many.ProcessEnded("A worker process ended."), "ended. Finished pairs are kept"),
     ):
         monkeypatch.setattr(many, "write_row", fails(error))
         with pytest.raises(many._EndsRun) as ended:
@@ -281,11 +294,11 @@ def test_what_would_fail_every_pair_ends_the_run(stages, monkeypatch):
 
 
 def depth_pairs(tmp_path, monkeypatch, stage, **more):
-    """``depth_pairs`` with stages that do ``stage``; steady frames and the table are real."""
+    """``depth_pairs`` with stages that do ``stage``; smoothed frames and the table are real."""
     made = {}
 
     class Stages:
-        def __init__(self, asked, device, pipe, *, tell, writers):
+        def __init__(self, asked, device, pipe, *, notify, writers):
             made.update(options=asked, device=device, pipe=pipe, writers=writers)
             self.all = (stage,)
 
@@ -330,15 +343,15 @@ def test_a_shard_has_its_part_and_a_table_of_its_own(tmp_path, monkeypatch, alon
         ".pairs.1-of-2.jsonl",
         "pairs.1-of-2.csv",
     ]
-    with pytest.raises(InputError, match="--steady needs all frames"):
-        depth_pairs(tmp_path, monkeypatch, lambda item: dict(ROW), shard="1/2", steady=True)
+    with pytest.raises(InputError, match="--temporal-smoothing needs all frames"):
+        depth_pairs(tmp_path, monkeypatch, lambda item: dict(ROW), shard="1/2", temporal_smoothing=True)
 
 
 def test_a_run_that_fails_as_a_whole_leaves_nothing(tmp_path, monkeypatch, alone):
     def stage(item):
         raise ValueError("no camera")
 
-    with pytest.raises(InputError, match="The same holds for all 3 pairs"):
+    with pytest.raises(InputError, match="All 3 pairs failed for this reason"):
         depth_pairs(tmp_path, monkeypatch, stage)
     assert not (tmp_path / "out").exists()
 
@@ -352,34 +365,34 @@ def test_a_run_that_fails_as_a_whole_leaves_nothing(tmp_path, monkeypatch, alone
     assert (tmp_path / "out/other").exists()
 
 
-def test_steady_frames_are_those_that_did_not_fail(tmp_path, monkeypatch, alone):
-    steady = []
+def test_smoothed_frames_are_those_that_did_not_fail(tmp_path, monkeypatch, alone):
+    temporal_smoothing = []
 
-    def note(asked, refs, views, tell):
-        steady.append((asked.steady, [ref.name for ref in refs], tell))
+    def note(asked, refs, views, notify):
+        temporal_smoothing.append((asked.temporal_smoothing, [ref.name for ref in refs], notify))
 
-    monkeypatch.setattr(many, "write_steady_frames", note)
+    monkeypatch.setattr(many, "write_smoothed_frames", note)
 
     def stage(item):
         if item.key == "b":
             raise ValueError("torn")
         return dict(ROW)
 
-    depth_pairs(tmp_path, monkeypatch, stage, steady=True)
-    assert steady == [(True, ["a", "c"], silent)]
+    depth_pairs(tmp_path, monkeypatch, stage, temporal_smoothing=True)
+    assert temporal_smoothing == [(True, ["a", "c"], silent)]
 
 
 def test_ray_makes_the_records_where_it_is_the_engine(tmp_path, monkeypatch, alone):
     asked = []
 
     def on_ray(name):
-        def function(given, found, journal, *, progress):
-            asked.append((name, given.engine, [item.key for item in found], progress))
-            return [{"key": item.key, **ROW} for item in found]
+        def function(given, found):
+            asked.append((name, given.engine, [item.key for item in found]))
+            yield from (Done(item.key, dict(ROW), None) for item in found)
 
         return function
 
     monkeypatch.setattr(many, "on_ray", on_ray)
     rows, made = depth_pairs(tmp_path, monkeypatch, None, engine="ray", layout="folders")
-    assert asked == [("pairs_to_folders", "ray", ["a", "b", "c"], False)] and made == {}
+    assert asked == [("pairs_to_folders", "ray", ["a", "b", "c"])] and made == {}
     assert [row["result"] for row in rows] == ["done"] * 3

@@ -1,9 +1,9 @@
-"""What does not fit the memory is said with its size; every other error stays as it is."""
+"""Out-of-memory errors are reported with the size; every other error is unchanged."""
 
 import pytest
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.jobs.memory import CURE, fitting_memory, is_out_of_memory
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.jobs.memory import MEMORY_HINT, fitting_memory, is_out_of_memory
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,7 @@ from geodiff_plugin.jobs.memory import CURE, fitting_memory, is_out_of_memory
         "std::bad_alloc",
     ],
 )
-def test_what_libraries_say_of_too_little_memory_is_recognised(words):
+def test_out_of_memory_errors_of_libraries_are_recognised(words):
     assert is_out_of_memory(RuntimeError(words)) and is_out_of_memory(MemoryError())
     caused = ValueError("behind it")
     caused.__cause__ = RuntimeError(words)
@@ -24,12 +24,12 @@ def test_what_libraries_say_of_too_little_memory_is_recognised(words):
     assert not is_out_of_memory(ValueError("shapes differ")) and not is_out_of_memory(None)
     with pytest.raises(InputError) as caught, fitting_memory("A pair", (4000, 3025), ", or sleep"):
         raise caused
-    said = "A pair of 4000x3025 pixels (12.1 megapixels) does not fit the memory."
-    assert str(caught.value) == f"{said} {CURE}, or sleep."
+    said = "A pair of 4000x3025 pixels (12.1 megapixels) does not fit in memory."
+    assert str(caught.value) == f"{said} {MEMORY_HINT}, or sleep."
     assert caught.value.__cause__ is caused
 
 
-def test_other_errors_and_those_that_are_told_already_stay_as_they_are():
+def test_other_errors_and_those_already_reported_are_unchanged():
     for error in (KeyError("a"), InputError("out of memory.png is torn"), ValueError("shapes")):
         with pytest.raises(type(error)) as caught, fitting_memory("A pair", (4, 3)):
             raise error

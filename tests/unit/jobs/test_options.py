@@ -1,12 +1,12 @@
 """Options of a pair and of a capture: their defaults and ranges, and how they exclude each other."""
 
-from dataclasses import MISSING, fields, replace
+from dataclasses import MISSING, replace
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.jobs.options import (
     CaptureOptions,
     DepthOptions,
@@ -15,7 +15,7 @@ from geodiff_plugin.jobs.options import (
     unique_names,
     with_folder,
 )
-from geodiff_plugin.options import rules_of
+from geodiff_plugin.settings import settings_of
 
 LEFT, RIGHT = Path("left.png"), Path("right.png")
 PAIR = {"left": LEFT, "right": RIGHT}
@@ -32,6 +32,7 @@ DEFAULTS = {
     "ensemble": 1,
     "dtype": "float32",
     "preset": "default",
+    "matcher": "sift",
     "tolerance": 0.005,
     "encoding": "16UC1",
     "min_confidence": 0.0,
@@ -45,6 +46,7 @@ OF_CAPTURES = {
     "prior": "bundled",
     "seed": 0,
     "device": "auto",
+    "dtype": "float32",
     "engine": "local",
 }
 #: The least and the largest value of a number, and whether it is whole.
@@ -54,6 +56,7 @@ RANGES = {
     "ensemble": (1, 1000, True),
     "resolution": (0, 8192, True),
     "tolerance": (0.0, 10.0, False),
+    "offset": (-86400, 86400, False),
     "min_confidence": (0, 1, False),
     "workers": (1, 10**6, True),
     "gpus": (0, 64, False),
@@ -71,10 +74,11 @@ def options(*parts: dict, **more) -> DepthOptions:
 
 @pytest.mark.parametrize(("kind", "expected"), [(DepthOptions, DEFAULTS), (CaptureOptions, OF_CAPTURES)])
 def test_defaults_are_those_of_the_manual(kind, expected):
-    for field in fields(kind):
-        if field.default is not MISSING and field.name not in expected:
-            assert field.default in (None, False, ()), field.name
-    found = {field.name: field.default for field in fields(kind) if field.name in expected}
+    defaults = {name: option.default for name, option in settings_of(kind).items()}
+    for name, default in defaults.items():
+        if default is not MISSING and name not in expected:
+            assert default in (None, False, ()), name
+    found = {name: default for name, default in defaults.items() if name in expected}
     assert found == expected
 
 
@@ -85,10 +89,7 @@ def test_defaults_are_those_of_the_manual(kind, expected):
 )
 def test_numbers_are_taken_up_to_the_ends_of_their_ranges(kind, ranges):
     given = {"left": LEFT} if kind is DepthOptions else {"path": LEFT}
-    with_range = {
-        field.name for field in fields(kind) if (rules := rules_of(field)) and rules.low is not None
-    }
-    assert with_range == set(ranges)
+    assert {name for name, option in settings_of(kind).items() if option.low is not None} == set(ranges)
 
     def check(name, value):
         made = kind(**given | {name: value} | (RAY if name in ("workers", "gpus") else {}))
@@ -117,8 +118,8 @@ def test_lengths_and_scales_are_finite_and_above_0(name):
                 options(**{name: value}).check()
 
 
-#: Options that exclude each other: those that are given, and a part of what is said.
-REFUSED = [
+#: Options that exclude each other: the given ones, and a part of the message.
+UNSUPPORTED = [
     ({**POINTS, **CAMERA, "preset": "paper"}, "--points cannot be used with --preset paper"),
     ({**DISPARITY, **CAMERA, "preset": "paper"}, "--disparity cannot be used with --preset paper"),
     (
@@ -127,13 +128,13 @@ REFUSED = [
     ),
     ({**PAIR, **CAMERA, "fov": 60.0}, "--fov needs --estimate-pose"),
     ({**PAIR, **CAMERA, "known_length": "1,2,3,4,5"}, "--known-length needs --estimate-pose"),
-    ({**PAIR, **CAMERA, "layout": "folders"}, "--as needs --engine ray"),
+    ({**PAIR, **CAMERA, "layout": "folders"}, "--format needs --engine ray"),
     ({**PAIR, **CAMERA, "workers": 2}, "--workers needs --engine ray"),
     ({**PAIR, **CAMERA, "gpus": 0.5}, "--gpus needs --engine ray"),
-    ({**PAIR, **CAMERA, **RAY, "shard": "0/2"}, "--shard is not for --engine ray"),
-    ({**PAIR, **CAMERA, **RAY, "steady": True}, "--steady needs --as folders"),
-    ({**PAIR, **CAMERA, **RAY, "export": ("glb",)}, "--export needs --as folders"),
-    ({**PAIR, **CAMERA, **RAY, "layout": "parquet", "into": LEFT}, "--into needs --as folders"),
+    ({**PAIR, **CAMERA, **RAY, "shard": "0/2"}, "--shard cannot be used with --engine ray"),
+    ({**PAIR, **CAMERA, **RAY, "temporal_smoothing": True}, "--temporal-smoothing needs --format folders"),
+    ({**PAIR, **CAMERA, **RAY, "export": ("glb",)}, "--export needs --format folders"),
+    ({**PAIR, **CAMERA, **RAY, "layout": "parquet", "reproject": LEFT}, "--reproject needs --format folders"),
     ({**PAIR, "estimate_pose": True, "calib": (LEFT,)}, "--calib cannot be used with --estimate-pose"),
     ({**PAIR, "estimate_pose": True, "e": LEFT}, "--E cannot be used with --estimate-pose"),
     ({**PAIR, "estimate_pose": True, "cx_right": 3.0}, "--cx-right cannot be used with --estimate-pose"),
@@ -141,7 +142,10 @@ REFUSED = [
         {**PAIR, "estimate_pose": True, "view": (LEFT,), "view_e": (LEFT,)},
         "--view-E cannot be used with --estimate-pose",
     ),
-    ({**PAIR, "estimate_pose": True, "steady": True}, "--steady cannot be used with --estimate-pose"),
+    (
+        {**PAIR, "estimate_pose": True, "temporal_smoothing": True},
+        "--temporal-smoothing cannot be used with --estimate-pose",
+    ),
     ({**PAIR, **CAMERA, "cameras": "1,2"}, "--cameras needs --calib"),
     ({**POINTS, **CAMERA, "right": RIGHT, "disparity": LEFT}, "--disparity cannot be used with --points"),
     ({**PAIR, **CAMERA, "points_scale": 1000.0}, "--points-scale needs --points or --disparity"),
@@ -152,9 +156,12 @@ REFUSED = [
     ({**DISPARITY, **CAMERA, "k_right": LEFT}, "--K-right needs RIGHT"),
     ({**POINTS, "fx": 500.0, "estimate_pose": True}, "--estimate-pose needs RIGHT"),
     ({"left": LEFT, "fx": 500.0}, "RIGHT is missing"),
-    ({**PAIR, **CAMERA, "side_by_side": True}, "--side-by-side has both views in LEFT"),
-    ({**POINTS, "fx": 500.0, "side_by_side": True}, "--side-by-side has both views in LEFT"),
-    ({"left": LEFT, **CAMERA, "side_by_side": True, "export": ("colmap",)}, "needs an image file a view"),
+    ({**PAIR, **CAMERA, "side_by_side": "auto"}, "--side-by-side reads both views from LEFT"),
+    ({**POINTS, "fx": 500.0, "side_by_side": "auto"}, "--side-by-side reads both views from LEFT"),
+    (
+        {"left": LEFT, **CAMERA, "side_by_side": "auto", "export": ("colmap",)},
+        "needs one image file per view",
+    ),
     ({**PAIR, **CAMERA, "view": (LEFT, RIGHT), "view_e": (LEFT,)}, "--view-E is given 1 times for 2 --view"),
     (
         {**PAIR, **CAMERA, "view": (LEFT, RIGHT), "view_e": (LEFT, LEFT), "view_k": (LEFT,)},
@@ -164,13 +171,19 @@ REFUSED = [
         {**PAIR, **CAMERA, "view": (LEFT,), "view_e": (LEFT,), "view_distortion": ("0,0", "0,0")},
         "--view-distortion is given 2 times for 1 --view",
     ),
+    ({**PAIR, **CAMERA, "holes": True}, "--holes needs --min-confidence or --max-sigma"),
+    (
+        {**PAIR, **CAMERA, "holes": True, "max_sigma": 0.1, "fill": True},
+        "--holes cannot be used with --fill: it fills every pixel",
+    ),
+    ({**PAIR, **CAMERA, "max_sigma": 0.0}, "--max-sigma must be a finite number of metres above 0; got 0"),
     ({**PAIR, **CAMERA, "prior": "map"}, "--prior map needs --prior-map"),
-    ({**PAIR, **CAMERA, "prior": "a/b", "prior_map": LEFT}, "leave out --prior a/b"),
+    ({**PAIR, **CAMERA, "prior": "a/b", "prior_map": LEFT}, "Omit --prior a/b"),
     ({**PAIR, **CAMERA, "near": 2.0}, "--near needs --far"),
     ({**PAIR, **CAMERA, "far": 2.0}, "--far needs --near"),
     ({**PAIR, **CAMERA, "near": 2.0, "far": 2.0}, "--near must be less than --far; got 2 and 2"),
-    ({**PAIR, **CAMERA, "resolution": 500}, "--resolution must be a multiple of 8.*Try 496"),
-    ({**PAIR, **CAMERA, "resolution": 24}, "--resolution must be a multiple of 8.*Try 32"),
+    ({**PAIR, **CAMERA, "resolution": 500}, "--resolution must be 0 or a multiple of 8.*Try 496"),
+    ({**PAIR, **CAMERA, "resolution": 24}, "--resolution must be 0 or a multiple of 8.*Try 32"),
     ({**PAIR, **CAMERA, "device": "cuda:"}, "--device must be auto"),
     ({**PAIR, **CAMERA, "device": "xcpu"}, "--device must be auto"),
     ({**PAIR, **CAMERA, "option": ("domain=",)}, "--option must be NAME=VALUE"),
@@ -181,9 +194,9 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(
-    ("given", "said"), REFUSED, ids=lambda value: value if isinstance(value, str) else ""
+    ("given", "said"), UNSUPPORTED, ids=lambda value: value if isinstance(value, str) else ""
 )
-def test_options_that_exclude_or_need_each_other_are_refused(given, said):
+def test_options_that_exclude_or_need_each_other_are_rejected(given, said):
     with pytest.raises(InputError, match=said):
         DepthOptions(**given).check_all()
 
@@ -199,11 +212,26 @@ TAKEN = [
     {**PAIR, "estimate_pose": True, "view": (Path("c"), Path("d"))},
     {**PAIR, **CAMERA, **VIEWS},
     {**PAIR, **CAMERA, **VIEWS, "view_k": (LEFT, LEFT), "view_distortion": ("0,0", "0,0")},
-    {**PAIR, **CAMERA, "shard": "0/2", "steady": True, "export": ("glb", "colmap"), "into": LEFT},
-    {**PAIR, **CAMERA, **RAY, "layout": "folders", "steady": True, "export": ("glb",), "into": LEFT},
+    {
+        **PAIR,
+        **CAMERA,
+        "shard": "0/2",
+        "temporal_smoothing": True,
+        "export": ("glb", "colmap"),
+        "reproject": LEFT,
+    },
+    {
+        **PAIR,
+        **CAMERA,
+        **RAY,
+        "layout": "folders",
+        "temporal_smoothing": True,
+        "export": ("glb",),
+        "reproject": LEFT,
+    },
     {**PAIR, **CAMERA, **RAY, "layout": "parquet", "workers": 3, "gpus": 0.5},
     {**PAIR, "calib": (LEFT,), "cameras": " 12 , 3 "},
-    {"left": LEFT, **CAMERA, "side_by_side": True, "export": ("glb",)},
+    {"left": LEFT, **CAMERA, "side_by_side": "auto", "export": ("glb",)},
     {**PAIR, **CAMERA, "prior_map": LEFT},
     {**PAIR, **CAMERA, "near": 1.0, "far": 1.5, "resolution": 32, "device": "cuda:12", "option": ("a=b=c",)},
     {**PAIR, **CAMERA, "resolution": 0},
@@ -216,67 +244,8 @@ def test_options_that_go_together_are_taken(given):
     DepthOptions(**given).check_all()
 
 
-WAYS = [
-    ({**PAIR, "calib": (LEFT,)}, "file"),
-    ({**PAIR, "calib": (LEFT,), "baseline": 0.1}, "file"),
-    ({**PAIR, "k": LEFT, "e": LEFT}, "matrices"),
-    ({**PAIR, "k": LEFT, "e": LEFT, "k_right": LEFT}, "matrices"),
-    ({**PAIR, **CAMERA}, "parameters"),
-    ({**PAIR, **CAMERA, "cx": 3.0, "cy": 2.0, "cropped": True, "cx_right": 4.0}, "parameters"),
-    ({**POINTS, "fx": 500.0}, "parameters"),
-    ({**POINTS, "k": LEFT}, "matrices"),
-    ({**DISPARITY, **CAMERA}, "parameters"),
-    ({**PAIR, "estimate_pose": True}, "EXIF"),
-    ({**PAIR, "estimate_pose": True, "baseline": 0.1}, "EXIF"),
-    ({**PAIR, "estimate_pose": True, "fov": 60.0}, "--fov"),
-    ({**PAIR, "estimate_pose": True, "k": LEFT}, "matrices"),
-    ({**PAIR, "estimate_pose": True, "fx": 500.0, "baseline": 0.1}, "parameters"),
-    ({**PAIR, "estimate_pose": True, "cropped": True, "view": (LEFT,), "view_k": (LEFT,)}, "EXIF"),
-]
-
-
-@pytest.mark.parametrize(("given", "way"), WAYS)
-def test_the_way_in_which_cameras_are_given_is_recognised(given, way):
-    assert DepthOptions(**given).cameras_way() == way
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        (
-            PAIR,
-            "The cameras are missing. Give --calib FILE, or --fx --baseline, or --K --E, or --estimate-pose",
-        ),
-        (POINTS, "The cameras are missing. Give --calib FILE, or --fx, or --K: there"),
-        (DISPARITY, "Give --calib FILE, or --fx --baseline, or --K --E, or"),
-        ({**PAIR, "fx": 500.0}, "With --fx give --baseline as well."),
-        ({**PAIR, "cy": 5.0, "cx": 3.0}, "With --cx --cy give --fx --baseline as well."),
-        ({**PAIR, "baseline": 0.1}, "With --baseline give --fx as well. For photographs alone add"),
-        ({**PAIR, "k": LEFT}, "With --K give --E as well."),
-        ({**PAIR, "e": LEFT}, "With --E give --K as well."),
-        ({**PAIR, "k_right": LEFT}, "With --K-right give --K --E as well."),
-        ({**PAIR, **CAMERA, "k": LEFT, "e": LEFT}, "in several ways, by matrices and parameters"),
-        ({**PAIR, "calib": (LEFT,), "fx": 500.0}, "in several ways, by file and parameters"),
-        (
-            {**PAIR, "estimate_pose": True, "k": LEFT, "fov": 60.0},
-            "K is given in several ways, by matrices and",
-        ),
-        ({**PAIR, **CAMERA, "cropped": True}, "With --cropped give --cx --cy as well"),
-        ({**PAIR, **CAMERA, "cropped": True, "cx": 3.0}, "With --cropped give --cx --cy as well"),
-        ({**PAIR, "estimate_pose": True, "cropped": True}, "--cropped needs --K.*EXIF does not tell"),
-        (
-            {**PAIR, "estimate_pose": True, "cropped": True, "fov": 60.0},
-            "--cropped needs --K.*--fov does not",
-        ),
-    ],
-)
-def test_cameras_that_are_given_in_part_or_twice_are_refused(given, said):
-    with pytest.raises(InputError, match=said):
-        DepthOptions(**given).cameras_way()
-
-
 def test_one_file_with_both_views_stands_for_left_and_right():
-    both = options({"left": LEFT, "side_by_side": True}, CAMERA)
+    both = options({"left": LEFT, "side_by_side": "auto"}, CAMERA)
     assert both.right == LEFT and both.both_in_one
     for suffix in (".mpo", ".HEIC", ".heif"):
         of_phone = options({"left": Path(f"photo{suffix}")}, CAMERA)
@@ -287,8 +256,8 @@ def test_one_file_with_both_views_stands_for_left_and_right():
     assert not options().both_in_one and options({"left": LEFT}, CAMERA).right is None
 
 
-def test_a_folder_of_side_by_side_pictures_is_no_pair(tmp_path):
-    assert options({"left": tmp_path, "side_by_side": True}, CAMERA).right is None
+def test_a_folder_of_side_by_side_images_is_no_pair(tmp_path):
+    assert options({"left": tmp_path, "side_by_side": "auto"}, CAMERA).right is None
 
 
 def test_a_map_takes_the_place_of_the_default_prior_alone():
@@ -299,8 +268,8 @@ def test_a_map_takes_the_place_of_the_default_prior_alone():
 
 def test_views_and_other_files_are_listed_with_the_names_of_their_options():
     given = options(PAIR, **VIEWS, calib=(Path("g"), Path("h")), k=Path("i"), points=Path("j"), out=Path("o"))
-    assert given.photographs() == {"LEFT": LEFT, "RIGHT": RIGHT, "--view 1": Path("c"), "--view 2": Path("d")}
-    assert options(POINTS).photographs() == {"LEFT": LEFT}
+    assert given.image_files() == {"LEFT": LEFT, "RIGHT": RIGHT, "--view 1": Path("c"), "--view 2": Path("d")}
+    assert options(POINTS).image_files() == {"LEFT": LEFT}
     expected = [
         ("calibration", "g"),
         ("calibration", "h"),
@@ -316,10 +285,10 @@ def test_views_and_other_files_are_listed_with_the_names_of_their_options():
 def test_the_topics_of_a_bag_are_left_and_right():
     topics = {"topic_left": "/left", "topic_right": "/right"}
     assert DepthOptions(left=LEFT, **topics).bag_topics() == ("/left", "/right")
-    for name, flag in (("topic_left", "--left"), ("topic_right", "--right")):
+    for name, flag in (("topic_left", "--left-topic"), ("topic_right", "--right-topic")):
         with pytest.raises(InputError, match=f"^{flag} is missing"):
             DepthOptions(left=LEFT, **topics | {name: None}).bag_topics()
-    with pytest.raises(InputError, match="^RIGHT is given, but LEFT is a bag"):
+    with pytest.raises(InputError, match="^RIGHT cannot be used with a bag"):
         DepthOptions(left=LEFT, right=RIGHT, **topics).bag_topics()
 
 
@@ -329,7 +298,7 @@ def test_two_cameras_are_named_left_first():
     assert options(PAIR).camera_pair() is None
 
 
-def test_names_of_files_are_told_apart_by_their_folders():
+def test_equal_file_names_are_distinguished_by_their_folders():
     assert unique_names([Path("a/x.png"), Path("b/y.png")]) == ["x.png", "y.png"]
     assert unique_names([Path("r/a/x.png"), Path("r/b/x.png")]) == ["a/x.png", "b/x.png"]
     assert unique_names([Path("a/x.png"), Path("a/x.jpg")]) == ["x.png", "x.jpg"]
@@ -339,7 +308,7 @@ def test_the_scale_of_a_capture_is_given_in_one_way_and_ray_has_its_options():
     ways = {"metres_per_unit": 2.0, "known_length": "a:1,2,3,4,5", "distance": "a,b,2"}
     for name, value in ways.items():
         assert getattr(CaptureOptions(path=LEFT, **{name: value}), name) == value
-    with pytest.raises(InputError, match="by --metres-per-unit and --distance"):
+    with pytest.raises(InputError, match="given more than once .--metres-per-unit, --distance"):
         CaptureOptions(path=LEFT, **{name: ways[name] for name in ("distance", "metres_per_unit")})
     assert CaptureOptions(path=LEFT, **RAY, workers=2, gpus=0.5).workers == 2
     for given, said in (
@@ -381,18 +350,18 @@ def test_every_named_file_is_looked_at_before_the_work(files):
     further = replace(given, view=(third,), view_e=(files / "E.txt",))
     check_files(further)
     for changes, said in (
-        ({"right": left}, "RIGHT must be another photograph than LEFT"),
-        ({"view": (right,)}, "--view 1 must be another photograph than RIGHT"),
+        ({"right": left}, "RIGHT must be another image than LEFT"),
+        ({"view": (right,)}, "--view 1 must be another image than RIGHT"),
         ({"right": files / "none.png"}, "none.png"),
         ({"right": files / "calib.txt"}, "RIGHT must be"),
         ({"calib": (files / "none.txt",)}, "calibration must be"),
         ({"view_e": (files / "none.txt",)}, "--view-E must be"),
-        ({"into": files / "calib.txt"}, "--into must be"),
+        ({"reproject": files / "calib.txt"}, "--reproject must be"),
     ):
         with pytest.raises(InputError, match=said):
             check_files(replace(further, **changes))
-    check_files(replace(further, right=files / "none.png"), photographs=False)
-    check_files(options({"left": left, "side_by_side": True}, calib=(files / "calib.txt",)))
+    check_files(replace(further, right=files / "none.png"), images=False)
+    check_files(options({"left": left, "side_by_side": "auto"}, calib=(files / "calib.txt",)))
 
 
 def test_a_pair_is_checked_before_its_folder_is_taken(files):
@@ -401,9 +370,9 @@ def test_a_pair_is_checked_before_its_folder_is_taken(files):
         start_pair(given)
     with pytest.raises(InputError, match="--seed"):
         start_pair(replace(given, **CAMERA, seed=-1))
-    start_pair(given, photographs=False)  # of a video, whose options are checked once
+    start_pair(given, images=False)  # of a video, whose options are checked once
     taken = replace(given, **CAMERA, out=files)
     with pytest.raises(InputError, match="--out"), start_pair(taken):
         pass
-    with pytest.raises(InputError, match="holds no input"), start_pair(replace(taken, overwrite=True)):
+    with pytest.raises(InputError, match="without inputs"), start_pair(replace(taken, overwrite=True)):
         pass

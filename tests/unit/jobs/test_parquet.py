@@ -12,7 +12,7 @@ pytest.importorskip("fsspec")
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.parquet import SCHEMA, Store
 from geodiff_plugin.jobs.rows import COLUMNS
@@ -38,8 +38,8 @@ def names(store: Store) -> list[str]:
 def test_results_and_errors_are_files_of_their_own_with_the_columns_of_a_result(store):
     assert store.begin(BASE) == set() and names(store) == ["job.json"]
     rows = ({"key": "a", "near_m": 1.5, "verdict": "trusted"}, {"key": "b", "error": "torn"}, {"key": "c"})
-    told = store.put(table(*rows)).to_pylist()
-    assert told == [
+    reported = store.put(table(*rows)).to_pylist()
+    assert reported == [
         {"key": "a", "verdict": "trusted", "error": None},
         {"key": "b", "verdict": None, "error": "torn"},
         {"key": "c", "verdict": None, "error": None},

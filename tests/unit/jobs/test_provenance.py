@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.cameras import Camera, Distortion
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.formats.layouts import CaptureFrame
 from geodiff_plugin.jobs.options import CaptureOptions
-from geodiff_plugin.jobs.provenance import RECORD, SUMMARY, Provenance, begin_frames, check_poses
-from geodiff_plugin.options import flag_of
-from geodiff_plugin.types import Distortion
+from geodiff_plugin.jobs.provenance import RECORD, SUMMARY, Provenance, check_poses, prepare_frames
+from geodiff_plugin.settings import settings_of
 
 #: Options that do not change the depth of a frame by themselves, and why.
 NO_DIFFERENCE = {
@@ -22,6 +22,7 @@ NO_DIFFERENCE = {
     "k": "counts by the camera of every frame",
     "trajectory": "counts by the pose of every frame",
     "images": "counts by the image of every frame",
+    "mask": "counts by the mask of every frame",
     "prior_map": "counts by the map of every frame",
     "out": "the folder of the frames",
     "frames": "which frames get depth; neighbours are chosen among all",
@@ -38,8 +39,8 @@ NO_DIFFERENCE = {
     "workers": "who makes a frame",
     "gpus": "who makes a frame",
     "device": "equal within rounding",
-    "graphs": "equal within rounding",
-    "no_kernels": "equal within rounding",
+    "cuda_graphs": "equal within rounding",
+    "no_triton": "equal within rounding",
 }
 #: Options that the poses depend on too.
 OF_POSES = {"poses", "fov"}
@@ -54,6 +55,7 @@ OTHERS = {
     "space": "log",
     "steps": 9,
     "seed": 5,
+    "dtype": "float16",
     "fov": 61.0,
 }
 
@@ -81,18 +83,21 @@ def frames(files) -> list[CaptureFrame]:
                 depth_per_m=1000.0,
                 index=number,
                 points=rng.random((6, 3)),
-                size=(64, 48),
-                K=np.diag([50.0 + number, 52.0, 1.0]),
-                lens=lens,
+                camera=Camera(np.diag([50.0 + number, 52.0, 1.0]), (64, 48), lens),
             )
         )
     return made
 
 
+OF_CAMERA = {each.name for each in fields(Camera)}
+
+
 def capture(files, unit="m", **changed) -> Capture:
-    """Two frames, the second with some fields set otherwise."""
+    """Two frames, the second, or its camera, with some fields set otherwise."""
     first, second = frames(files)
-    return Capture([first, replace(second, **changed)], "test", unit, ())
+    of_camera = {name: changed.pop(name) for name in changed.keys() & OF_CAMERA}
+    second = replace(second, camera=replace(second.camera, **of_camera), **changed)
+    return Capture([first, second], "test", unit, ())
 
 
 def provenance(files, of: Capture | None = None, **options) -> Provenance:
@@ -100,21 +105,24 @@ def provenance(files, of: Capture | None = None, **options) -> Provenance:
     return Provenance.of(of or capture(files), CaptureOptions(**given))
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(CaptureOptions)])
+FLAGS = {name: option.flag for name, option in settings_of(CaptureOptions).items()}
+
+
+@pytest.mark.parametrize("name", FLAGS)
 def test_every_option_makes_other_frames_or_is_listed_with_a_reason(name, files):
     assert (name in OTHERS) != (name in NO_DIFFERENCE)
-    before, field = provenance(files), CaptureOptions.__dataclass_fields__[name]
+    before = provenance(files)
     assert before.key == provenance(files).key
     if name in NO_DIFFERENCE:
-        assert flag_of(field) not in before.settings
+        assert FLAGS[name] not in before.settings
         return
     after = provenance(files, **{name: OTHERS[name]})
     assert after.key != before.key
     assert (after.for_poses().key != before.for_poses().key) == (name in OF_POSES)
     (said,) = after.differences(before)
-    assert flag_of(field) in said and str(OTHERS[name]) in said
+    assert FLAGS[name] in said and str(OTHERS[name]) in said
     (said,) = before.differences(after)
-    assert f"made with {flag_of(field)} {OTHERS[name]} instead of " in said
+    assert f"made with {FLAGS[name]} {OTHERS[name]} instead of " in said
 
 
 CHANGED = {
@@ -126,27 +134,28 @@ CHANGED = {
     "points": lambda files: np.ones((6, 3)),
     "size": lambda files: (48, 64),
     "K": lambda files: np.diag([51.0, 52.5, 1.0]),
-    "lens": lambda files: Distortion("fisheye", frames(files)[1].lens.coefficients),
+    "lens": lambda files: Distortion("fisheye", frames(files)[1].camera.lens.coefficients),
     "as_stored": lambda files: True,
+    "mask": lambda files: files / "f0.png",
 }
-KIND_OF = {"image": "image", "depth": "depth", "depth_per_m": "depth", "points": "points"}
+KIND_OF = {"image": "image", "mask": "mask", "depth": "depth", "depth_per_m": "depth", "points": "points"}
 
 
 @pytest.mark.parametrize("field", CHANGED)
 def test_every_field_of_a_frame_is_in_its_key(field, files):
-    assert {each.name for each in fields(CaptureFrame)} - {"name"} == set(CHANGED)
+    assert {each.name for each in fields(CaptureFrame)} - {"name", "camera"} | OF_CAMERA == set(CHANGED)
     before = provenance(files)
     after = provenance(files, capture(files, **{field: CHANGED[field](files)}))
     kind = KIND_OF.get(field, "camera")
     words = {"points": "known points", "depth": "measured depth"}.get(kind, kind)
     assert after.key != before.key and after.differences(before) == [f"made before the {words} of f1 changed"]
-    of_poses = kind in ("image", "camera")
+    of_poses = kind in ("image", "camera", "mask")
     assert (after.for_poses().key != before.for_poses().key) == of_poses
 
 
 def test_coefficients_units_and_contents_of_files_are_in_the_key_too(files):
     before = provenance(files)
-    other_lens = Distortion("opencv", frames(files)[1].lens.coefficients * 1.001)
+    other_lens = Distortion("opencv", frames(files)[1].camera.lens.coefficients * 1.001)
     keys = {before.key, provenance(files, capture(files, lens=other_lens)).key}
     keys.add(provenance(files, capture(files, unit=None)).key)
     for name, words in (
@@ -167,7 +176,7 @@ def test_coefficients_units_and_contents_of_files_are_in_the_key_too(files):
 def test_the_order_and_number_of_frames_and_the_version_are_in_it(files):
     before = provenance(files)
     fewer = provenance(files, Capture(frames(files)[:1], "test", "m", ()))
-    assert fewer.differences(before) == ["made of 2 frames instead of 1, or of other names"]
+    assert fewer.differences(before) == ["made of 2 frames instead of 1, or of frames with other names"]
     assert before.version == __version__
     other = replace(before, version="0.0.1")
     assert other.key != before.key
@@ -175,11 +184,11 @@ def test_the_order_and_number_of_frames_and_the_version_are_in_it(files):
 
 
 def test_many_changed_frames_are_named_by_the_first(files):
-    made = [replace(frames(files)[0], name=f"f{number}") for number in range(5)]
+    made = [replace(frames(files)[0], name=f"f{number}") for number in range(7)]
     before = provenance(files, Capture(made, "test", "m", ()))
-    for count, words in ((2, "f0, f1"), (3, "f0, f1, f2"), (4, "f0, f1, f2, ...")):
-        K = np.eye(3)
-        changed = [replace(frame, K=K) if i < count else frame for i, frame in enumerate(made)]
+    for count, words in ((2, "f0, f1"), (3, "f0, f1, f2"), (6, "f0, f1, f2, f3, f4 and 1 more")):
+        other = Camera(np.eye(3), (64, 48))
+        changed = [replace(frame, camera=other) if i < count else frame for i, frame in enumerate(made)]
         after = provenance(files, Capture(changed, "test", "m", ()))
         assert after.differences(before) == [f"made before the camera of {words} changed"]
 
@@ -201,32 +210,32 @@ def finish(out: Path, name: str, key: str | None) -> None:
     (out / name / "depth_alone.npy").write_text("depth")
 
 
-def test_frames_of_the_same_run_stay_and_those_of_another_are_refused_or_cleared(files):
+def test_frames_of_the_same_run_stay_and_those_of_another_are_rejected_or_cleared(files):
     made, other, out = provenance(files), provenance(files, seed=9), files / "out"
     finish(out, "f0", made.key)
     made.write(out)
     (out / SUMMARY).write_text("{}")
-    begin_frames(made, out, ["f0", "f1"], overwrite=False)
+    prepare_frames(made, out, ["f0", "f1"], overwrite=False)
     assert (out / "f0/depth_alone.npy").exists() and (out / SUMMARY).exists()
 
     with pytest.raises(InputError, match=r"made with --seed 0 instead of 9.*--overwrite"):
-        begin_frames(other, out, ["f1"], overwrite=False)
+        prepare_frames(other, out, ["f1"], overwrite=False)
     assert Provenance.read(out) == made and (out / SUMMARY).exists()
 
-    begin_frames(other, out, ["f1"], overwrite=True)
+    prepare_frames(other, out, ["f1"], overwrite=True)
     assert not (out / "f0").exists() and not (out / SUMMARY).exists()
     assert Provenance.read(out) == other
 
 
-def test_a_frame_whose_origin_nobody_knows_is_refused_if_it_is_to_be_made(files):
+def test_a_frame_whose_origin_nobody_knows_is_rejected_if_it_is_to_be_made(files):
     made, out = provenance(files), files / "out"
     for name in ("f0", "f1", "f2", "f3"):
         finish(out, name, None)
-    with pytest.raises(InputError, match=r"where f\d, f\d, f\d has other settings or inputs"):
-        begin_frames(made, out, ["f0", "f1", "f2", "f3"], overwrite=False)
-    with pytest.raises(InputError, match=r"where f2 has other"):
-        begin_frames(made, out, ["f2"], overwrite=False)
-    begin_frames(made, out, ["f9"], overwrite=False)
+    with pytest.raises(InputError, match=r"other settings or inputs of f\d, f\d, f\d, f\d"):
+        prepare_frames(made, out, ["f0", "f1", "f2", "f3"], overwrite=False)
+    with pytest.raises(InputError, match=r"other settings or inputs of f2"):
+        prepare_frames(made, out, ["f2"], overwrite=False)
+    prepare_frames(made, out, ["f9"], overwrite=False)
     assert (out / "f3").exists() and Provenance.read(out) == made
 
 

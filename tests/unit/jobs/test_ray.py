@@ -1,21 +1,24 @@
 """Pairs on Ray, without Ray: a stand-in of its data sets calls each stage, and notes what is asked for."""
 
 import importlib
+import inspect
 import os
 import pickle
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.jobs.failures import DiskFull, Failures
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef
+from geodiff_plugin.jobs.runner import Runner
 
 OURS = ("jobs.ray", "jobs.cluster", "jobs.parquet")
 OPTIONS = DepthOptions(
@@ -103,10 +106,10 @@ def ray(monkeypatch):
     ],
 )
 def test_there_are_as_many_actors_as_the_cluster_has_room_for(ray, count, gpus, resources, most):
-    """An actor with its GPU; on CPUs half of one, and two tasks of a quarter beside it."""
+    """An actor with its GPU; on CPUs half of one, and two tasks of a quarter next to it."""
     ray.resources = resources
     workers = ray.ours.Workers(count, gpus)
-    assert workers.most() == most
+    assert workers.max_count() == most
     assert workers.for_rows(most) is workers and workers.for_rows(most + 5) is workers
     if most > 1:
         assert workers.for_rows(most - 1) == ray.ours.Workers(most - 1, gpus)
@@ -116,7 +119,7 @@ def test_there_are_as_many_actors_as_the_cluster_has_room_for(ray, count, gpus, 
     size = {"size": count} if count else {"min_size": 1, "max_size": most}
     expected = {"compute": ("actors", size), "num_cpus": 0.5, "num_gpus": on_gpu or None}
     assert arguments == expected
-    beside = workers.stages_beside()
+    beside = workers.task_arguments()
     assert beside == {"num_cpus": 0.25, "compute": ("tasks", None if on_gpu else most)}
 
 
@@ -288,12 +291,12 @@ def test_what_ends_a_run_on_ray_is_an_input_error(ray, monkeypatch):
         raise ValueError("a defect")
     monkeypatch.setenv("RANK", "1")
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(InputError, match="start it once, without RANK"), cluster.connected():
+    with pytest.raises(InputError, match="Start it once, without RANK"), cluster.connected():
         pass
 
 
 def test_records_of_items_are_made_where_they_are_missing(ray, tmp_path):
-    items, told, asked = [Item(key) for key in "abcd"], [], []
+    items, reported, asked = [Item(key) for key in "abcd"], [], []
 
     def make():
         def work(key):
@@ -306,14 +309,13 @@ def test_records_of_items_are_made_where_they_are_missing(ray, tmp_path):
 
     with Journal(tmp_path / "job.jsonl") as journal:
         journal.put(items[0], {"made": "before"})
-        failures = Failures(4, "frame", told.append)
-        options = SimpleNamespace(workers=2, gpus=0.0)
-        records = ray.cluster.items_on_actors(items, journal, make, options, failures, False)
+        work = partial(ray.cluster.items_on_actors, make, SimpleNamespace(workers=2, gpus=0.0))
+        records = Runner(items, journal, progress=False).run_elsewhere(work, reported.append)
         assert asked == ["b", "c", "d"]
         assert [record.get("made") for record in records] == ["before", "b", None, "d"]
         assert records[2] == {"key": "c", "status": BROKEN, "error": "c is torn"}
-        assert told == ["geodiff: c: c is torn"]
-        again = ray.cluster.items_on_actors(items[:2], journal, make, options, failures, False)
+        assert reported == ["geodiff: c: c is torn"]
+        again = Runner(items[:2], journal, progress=False).run_elsewhere(work, reported.append)
         assert [record["made"] for record in again] == ["before", "b"] and asked == ["b", "c", "d"]
 
 
@@ -328,7 +330,8 @@ def test_pairs_become_folders_with_the_options_of_a_run_without_ray(ray, stages,
     monkeypatch.setattr(cluster, "_folder_of", folder_of)
     items = [Item(ref.name, ref) for ref in refs(4)]
     with Journal(tmp_path / "job.jsonl") as journal:
-        records = cluster.pairs_to_folders(OPTIONS, items, journal)
+        runner = Runner(items, journal, progress=False)
+        records = runner.run_elsewhere(partial(cluster.pairs_to_folders, OPTIONS))
     assert written[0] == ("priors.find_prior", "bundled")
     alone = replace(OPTIONS, engine="local", layout=None, workers=None, gpus=None)
     assert written[1:] == [alone] * 3 and stages == [alone]
@@ -340,17 +343,15 @@ def test_pairs_become_folders_with_the_options_of_a_run_without_ray(ray, stages,
 def test_a_folder_that_a_lost_attempt_has_written_stays(ray, tmp_path, monkeypatch):
     cluster, asked = ray.cluster, []
     monkeypatch.setattr(cluster, "finished_row", lambda options: asked.append(options) or {"near_m": 1.0})
-    monkeypatch.setattr(
-        cluster, "write_row", lambda folder, run, entries: {"near_m": 2.0, "entries": entries}
-    )
+    monkeypatch.setattr(cluster, "write_row", lambda folder, run: {"near_m": 2.0, "of": run})
     options = replace(OPTIONS, out=tmp_path / "out", left=tmp_path / "left.png")
-    pair = Guided(options, "a", SimpleNamespace(options=options), {"pair": 1})
-    assert cluster._folder_of(pair) == {"near_m": 1.0} and asked == [options]
-    pair.run.options = replace(options, overwrite=True)
-    assert cluster._folder_of(pair) == {"near_m": 2.0, "entries": {"pair": 1}} and len(asked) == 1
+    run = SimpleNamespace(options=options)
+    assert cluster._folder_of(run) == {"near_m": 1.0} and asked == [options]
+    run.options = replace(options, overwrite=True)
+    assert cluster._folder_of(run) == {"near_m": 2.0, "of": run} and len(asked) == 1
     monkeypatch.setattr(cluster, "finished_row", lambda options: None)
-    pair.run.options = options
-    assert cluster._folder_of(pair)["near_m"] == 2.0
+    run.options = options
+    assert cluster._folder_of(run)["near_m"] == 2.0
 
 
 @pytest.mark.parametrize(("pairs", "workers", "size"), [(6, 2, 4), (100, 2, 13), (520, 1, 64), (5, 9, 4)])
@@ -379,7 +380,7 @@ def test_rows_of_parquet_files_are_counted_as_they_are_written(
     result = cluster.pairs_to_parquet(options, refs(pairs))
     failed = {f"p{n}" for n in range(pairs) if n % 10 in (3, 5)}
     assert set(result.failed) == failed and result.failed["p3"] == "p3 is torn"
-    assert (result.uri, result.there, result.done) == ("s3://out", 2, pairs - 2 - len(failed))
+    assert (result.uri, result.kept, result.done) == ("s3://out", 2, pairs - 2 - len(failed))
     assert result.not_trusted == 0
     assert begun == [replace(options, engine="local", layout=None, workers=None, gpus=None)]
     assert ray.asked[-1][1]["batch_size"] == size
@@ -388,3 +389,25 @@ def test_rows_of_parquet_files_are_counted_as_they_are_written(
     for verdict in ("trusted", "not trusted", "not judged"):
         cluster._count({"key": "a", "error": None, "verdict": verdict}, result, Failures(3, "pair", print))
     assert (result.done, result.not_trusted) == (3, 2)
+
+
+def test_nothing_is_shown_nor_fixed_unless_the_caller_asks_for_it(ray, stages, monkeypatch, tmp_path):
+    """The declared defaults: no bar, and as many actors, with as many GPUs, as the cluster has."""
+    cluster, bars = ray.cluster, []
+    assert inspect.signature(cluster.pairs_to_parquet).parameters["progress"].default is False
+    own = cluster.tqdm
+    monkeypatch.setattr(
+        cluster, "tqdm", lambda **reported: bars.append(reported) or own(**reported | {"disable": True})
+    )
+    monkeypatch.setattr(cluster, "imported", lambda where: lambda prior: None)
+    for disable in (True, False):
+        with cluster._bar(3, 1, not disable):
+            pass
+    assert [bar["disable"] for bar in bars] == [True, False]
+    assert all((bar["total"], bar["initial"], bar["file"]) == (3, 1, sys.stderr) for bar in bars)
+    workers = ray.ours.Workers()
+    assert (workers.count, workers.gpus) == (None, None)
+    assert inspect.signature(ray.ours.depth_dataset).parameters["workers"].default == workers
+    result = cluster.ParquetResult("uri", 4)
+    assert (result.kept, result.done, result.not_trusted, result.failed) == (4, 0, 0, {})
+    assert cluster.ParquetResult("uri", 4).failed is not result.failed

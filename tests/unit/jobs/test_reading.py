@@ -1,76 +1,30 @@
-"""The files of a pair become its images, cameras, lenses and known depths: each view with its own."""
+"""The files of a pair become images and a guidance: each view with its own image, camera and pose."""
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError, UnknownPoseError
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.jobs import reading
+from geodiff_plugin.jobs.cameras import read_cameras
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.reading import lenses_of, read_pair, read_rig
-from geodiff_plugin.types import Distortion, Rig
-from tests.unit.jobs.made_runs import pose
-
-#: ``(width, height)`` of the left image, the right one and two further views.
-SIZES = ((54, 40), (60, 46), (64, 50), (48, 36))
-KS = [
-    np.array([[50.0 + n, 0, (w - 1) / 2 + 1.5], [0, 47.0 - n, (h - 1) / 2 - 0.5], [0, 0, 1]])
-    for n, (w, h) in enumerate(SIZES)
-]
-ES = [
-    np.eye(4),
-    pose((1, -3, 2), (0.11, 0.02, -0.01)),
-    pose((2, 4, -1), (-0.2, 0.1, 0.03)),
-    pose((0, 0, 3), (0.1, -0.3, 0)),
-]
-LENSES = ("-0.2,0.05,0.001,0", "-0.1,0.02,0,0.002", "fisheye:0.05,0.01,0,0")
-NAMES = ("left", "right", "third", "fourth")
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory) -> Path:
-    folder, rng = tmp_path_factory.mktemp("reading"), np.random.default_rng(1)
-    for name, (width, height), K, E in zip(NAMES, SIZES, KS, ES, strict=True):
-        smooth = cv2.resize(rng.random((9, 11, 3)), (width, height), interpolation=cv2.INTER_CUBIC)
-        image = np.clip(smooth * 200 + 20, 0, 255).astype(np.uint8)
-        Image.fromarray(image).save(folder / f"{name}.png")
-        np.savetxt(folder / f"K-{name}.txt", K)
-        np.save(folder / f"E-{name}.npy", E)
-    return folder
-
-
-def image_of(files, name) -> np.ndarray:
-    return np.asarray(Image.open(files / f"{name}.png"), np.float32) / 255
-
-
-def options(files, *views: str, **more) -> DepthOptions:
-    """Of a pair given by matrices, with further views."""
-    given = {
-        "left": files / "left.png",
-        "right": files / "right.png",
-        "k": files / "K-left.txt",
-        "k_right": files / "K-right.txt",
-        "e": files / "E-right.npy",
-        "view": tuple(files / f"{name}.png" for name in views),
-        "view_e": tuple(files / f"E-{name}.npy" for name in views),
-        "view_k": tuple(files / f"K-{name}.txt" for name in views),
-    }
-    return DepthOptions(**given | more)
-
-
-BARE = {"k": None, "k_right": None, "e": None}
-NUMBERS = BARE | {"fx": 50.0, "baseline": 0.12}
+from geodiff_plugin.jobs.pairs import PairRef
+from geodiff_plugin.jobs.reading import read_pair
+from tests.unit.formats.test_frame_packing import packed
+from tests.unit.jobs.pair_files import BARE, ES, KS, LENSES, NAMES, NUMBERS, SIZES, image_of, options
 
 
 def test_every_view_has_its_own_image_camera_and_pose(files):
-    pair = read_pair(options(files, "third", "fourth", knob=("planes=99",), preset="fast"))
+    pair = read_pair(options(files, "third", "fourth", parameter=("planes=99",), preset="fast"))
     guidance = pair.guidance
-    np.testing.assert_allclose(guidance.inputs[0].K_left, KS[0])
+    np.testing.assert_allclose(guidance.inputs[0].left.K, KS[0])
     assert len(guidance.rigs) == 3
     for number, (rig, right) in enumerate(zip(guidance.rigs, guidance.rights, strict=True), 1):
         np.testing.assert_allclose(rig.K_left, KS[0])
@@ -82,7 +36,7 @@ def test_every_view_has_its_own_image_camera_and_pose(files):
     assert pair.rig.source == str(files / "K-left.txt") and not pair.rig.measured
     assert not guidance.measured_baseline and guidance.unit == "m"
     assert (guidance.config.planes, guidance.config.pose) == (99, "given")
-    assert guidance.assumed == [] and not pair.undistorted and pair.notes == () and pair.prior_map is None
+    assert guidance.findings == [] and not pair.undistorted and pair.prior_map is None
 
 
 def test_what_is_not_given_of_a_view_is_that_of_the_left_one(files, tmp_path):
@@ -91,49 +45,30 @@ def test_what_is_not_given_of_a_view_is_that_of_the_left_one(files, tmp_path):
     pair = read_pair(given)
     for rig in pair.guidance.rigs:
         np.testing.assert_allclose(rig.K_right, KS[0])
-    assert [message.code for message in pair.guidance.assumed] == ["camera.same-centre"]
+    assert [each.code for each in pair.guidance.findings] == ["camera.assumed-cx"]
     pair = read_pair(replace(given, k_right=files / "K-left.txt"))
-    assert pair.guidance.assumed == [], "it is given, and the same"
+    assert pair.guidance.findings == [], "it is given, and the same"
 
 
-def test_numbers_that_are_left_out_are_filled_in_and_said(files):
+def test_missing_numbers_are_filled_in_and_reported(files):
     (width, height), pair = SIZES[0], read_pair(options(files, **NUMBERS))
-    K = pair.guidance.inputs[0].K_left
+    K = pair.guidance.inputs[0].left.K
     expected = np.array([[50.0, 0, (width - 1) / 2], [0, 50.0, (height - 1) / 2], [0, 0, 1]])
     np.testing.assert_allclose(K, expected)
     np.testing.assert_allclose(pair.rig.K_right, expected)
     np.testing.assert_allclose(pair.rig.E, np.eye(4) + 0.12 * np.eye(4, k=3))
-    said = " ".join(pair.guidance.assumed)
-    assert "fy is assumed to be fx; cx and cy are assumed to be the middle" in said
-    assert "(--fy, --cx, --cy)" in said and pair.guidance.measured_baseline
+    said = " ".join(pair.guidance.findings)
+    assert "fy is assumed equal to fx; cx and cy are assumed at the image centre" in said
+    assert "with --fy, --cx, --cy." in said and pair.guidance.measured_baseline
     given = {"fy": 46.0, "cx": 25.0, "cy": 18.0, "cx_right": 28.0}
     pair = read_pair(options(files, **NUMBERS, **given))
     np.testing.assert_allclose(pair.rig.K_left, [[50, 0, 25], [0, 46, 18], [0, 0, 1]])
     np.testing.assert_allclose(pair.rig.K_right, [[50, 0, 28], [0, 46, 18], [0, 0, 1]])
-    assert pair.guidance.assumed == []
+    assert pair.guidance.findings == []
     pair = read_pair(options(files, **NUMBERS, cx=25.0, fy=46.0))
-    assert "cy is assumed to be the middle of the image. Give the calibrated numbers (--cy)." in " ".join(
-        pair.guidance.assumed
+    assert "cy is assumed at the image centre. Pass calibrated values with --cy." in " ".join(
+        pair.guidance.findings
     )
-
-
-def test_a_calibration_is_for_images_of_its_size(files, tmp_path):
-    (width, height), camera = SIZES[0], "[50 0 28; 0 50 19; 0 0 1]"
-    text = f"cam0={camera}\ncam1={camera}\ndoffs=0\nbaseline=110\nwidth={{}}\nheight={height}\nndisp=9\n"
-    same = files / "left.png"
-    other = tmp_path / "other.png"
-    Image.open(same).transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(other)
-    calib = tmp_path / "calib.txt"
-    calib.write_text(text.format(width))
-    base = options(files, **BARE, right=other, calib=(calib,))
-    pair = read_pair(base)
-    assert pair.rig.E[0, 3] == pytest.approx(0.11) and pair.rig.rectified
-    assert read_pair(replace(base, baseline=0.3)).rig.E[0, 3] == pytest.approx(0.3)
-    with pytest.raises(InputError, match=r"the right image \S*right.png must be of 54x40 pixels"):
-        read_pair(replace(base, right=files / "right.png"))
-    calib.write_text(text.format(width + 1))
-    with pytest.raises(InputError, match=r"the left image \S*left.png must be of 55x40 pixels"):
-        read_pair(base)
 
 
 def test_known_depths_alone_need_one_camera(files, tmp_path):
@@ -146,7 +81,7 @@ def test_known_depths_alone_need_one_camera(files, tmp_path):
     points = pair.guidance.inputs[0].points.numpy()
     np.testing.assert_allclose(points[:, :3] * 1000, [[0.1, 0.2, 2.5], [0.0, -0.1, 3000.0]], rtol=1e-6)
     np.testing.assert_allclose(points[:, 3], [0.25, 0.75])
-    np.testing.assert_allclose(pair.guidance.inputs[0].K_left, KS[0])
+    np.testing.assert_allclose(pair.guidance.inputs[0].left.K, KS[0])
     by_numbers = read_pair(options(files, **alone | {"k": None}, fx=50.0))
     np.testing.assert_allclose(by_numbers.rig.E, np.eye(4))
     outside = np.array([[50.0, 0, 90], [0, 50, 19], [0, 0, 1]])
@@ -154,27 +89,6 @@ def test_known_depths_alone_need_one_camera(files, tmp_path):
     with pytest.raises(InputError, match="K "):
         read_pair(options(files, **alone | {"k": tmp_path / "K.txt"}))
     read_pair(options(files, **alone | {"k": tmp_path / "K.txt"}, cropped=True))
-
-
-def test_disparities_become_depths_by_the_rig(files, tmp_path):
-    width, height = SIZES[0]
-    disparity = np.full((height, width), 4.0, np.float32)
-    disparity[3, 5] = 8.0
-    np.save(tmp_path / "disparity.npy", disparity * 16)
-    more = {
-        "right": None,
-        "disparity": tmp_path / "disparity.npy",
-        "points_scale": 16.0,
-        "cx": 26.0,
-        "cy": 19.0,
-    }
-    pair = read_pair(options(files, **NUMBERS | more, fy=50.0, cx_right=29.0))
-    known = pair.guidance.inputs[0].points.numpy()
-    assert known.shape == (height, width)
-    np.testing.assert_allclose(known[3, 5], 50 * 0.12 / (8 + 3), rtol=1e-5)
-    np.testing.assert_allclose(known[20, 30], 50 * 0.12 / (4 + 3), rtol=1e-5)
-    with pytest.raises(InputError, match="--disparity needs a calibrated rectified rig"):
-        reading._read_known(options(files, **NUMBERS | more), KS[0], None, SIZES[0])
 
 
 def test_images_are_undistorted_by_the_lens_of_each_view(files):
@@ -186,7 +100,7 @@ def test_images_are_undistorted_by_the_lens_of_each_view(files):
             "fourth",
             distortion=(first, second),
             view_distortion=(third, "0,0,0,0"),
-            knob=("clean_photographs=false",),
+            parameter=("clean_images=false",),
         )
     )
     assert pair.undistorted
@@ -212,116 +126,35 @@ def test_images_are_undistorted_by_the_lens_of_each_view(files):
         np.testing.assert_allclose(image[inside], expected[inside], atol=0.02)
 
 
-def lens(text: str | None) -> Distortion | None:
-    return None if text is None else Distortion("opencv", np.array(text.split(","), float))
-
-
-def numbers_of(lenses) -> list[str | None]:
-    return [None if each is None else ",".join(f"{x:g}" for x in each.coefficients) for each in lenses]
-
-
-FLAT = "0,0,0,0"
-A, B, C = "-0.2,0.05,0.001,0", "-0.1,0.02,0,0.002", "0.3,0,0,0"
-
-
-@pytest.mark.parametrize(
-    ("typed", "further", "of_rig", "views", "expected"),
-    [
-        ((), (), (None, None), 0, [None, None]),
-        ((A,), (), (None, None), 0, [A, A]),
-        ((A, B), (), (None, None), 2, [A, B, A, A]),
-        ((A, FLAT), (C, FLAT), (None, None), 2, [A, None, C, None]),
-        ((), (), (A, B), 1, [A, B, A]),
-        ((C,), (), (A, B), 1, [C, C, C]),
-        ((FLAT,), (B,), (A, A), 1, [None, None, B]),
-    ],
-)
-def test_every_view_has_the_lens_that_is_typed_else_that_of_the_rig(
-    files, typed, further, of_rig, views, expected
-):
-    names = ("third", "fourth")[:views]
-    rig = Rig(KS[0], KS[1], ES[1], distortion=tuple(map(lens, of_rig)))
-    given = options(files, *names, distortion=typed, view_distortion=further)
-    given = replace(given, view_k=given.view_k if further else ())
-    assert numbers_of(lenses_of(given, rig)) == expected
-    if of_rig == (None, None):
-        assert numbers_of(lenses_of(given)) == expected
-
-
-def test_lenses_that_contradict_something_are_refused(files):
-    rectified = Rig(KS[0], KS[1], ES[1], rectified=True, source="calib.txt")
-    path = files / "left.png"
-    for given, rig, said in (
-        ({"distortion": (A, B, C)}, None, "--distortion is given 3 times"),
-        ({"distortion": (FLAT, A)}, rectified, "calib.txt is for rectified images"),
-        ({"distortion": (A,), "points_confidence": path}, None, "--points-confidence cannot be used"),
-        ({"distortion": (A,), "disparity": path}, None, "--disparity cannot be used"),
-        ({"distortion": (A,), "prior_map": path}, None, "--prior-map cannot be used"),
-    ):
-        with pytest.raises(InputError, match=said):
-            lenses_of(options(files, **given), rig)
-    with pytest.raises(InputError, match="--view-K is given, and the lens of LEFT distorts"):
-        lenses_of(options(files, "third", distortion=(FLAT, A)))
-    with pytest.raises(InputError, match="--view-distortion must be"):
-        lenses_of(options(files, "third", view_distortion=("1",)))
-    lenses_of(options(files, distortion=(FLAT,)), rectified)
-    lenses_of(options(files, distortion=(FLAT, A), prior_map=path))  # the left lens does not distort
-    lenses_of(options(files, "third", distortion=(FLAT, FLAT)))
-
-
-def test_a_map_of_known_depths_becomes_points_behind_a_lens(files, tmp_path):
-    (width, height), rng = SIZES[0], np.random.default_rng(3)
-    depth_m = np.where(rng.random((height, width)) < 0.2, rng.uniform(1, 3, (height, width)), 0.0)
-    np.save(tmp_path / "map.npy", depth_m.astype(np.float32))
-    given = options(files, points=tmp_path / "map.npy")
-    np.testing.assert_allclose(reading._read_known(given, KS[0], None, SIZES[0]), depth_m, rtol=1e-6)
-    points = reading._read_known(given, KS[0], lens(A), SIZES[0])
-    pixels, _ = cv2.projectPoints(
-        points.astype(float), np.zeros(3), np.zeros(3), KS[0], lens(A).coefficients.astype(float)
-    )
-    v, u = np.nonzero(depth_m)
-    np.testing.assert_allclose(pixels[:, 0], np.stack([u, v], 1), atol=0.01)
-    np.testing.assert_allclose(points[:, 2], depth_m[v, u], rtol=1e-5)
-    with pytest.raises(InputError, match="a map of the left image's 40x54 pixels; got 54x40"):
-        reading._read_known(given, KS[0], lens(A), SIZES[0][::-1])
-    cloud = np.array([[0.1, 0.2, 2.0]])
-    np.save(tmp_path / "cloud.npy", cloud)
-    np.testing.assert_allclose(
-        reading._read_known(options(files, points=tmp_path / "cloud.npy"), KS[0], lens(A), SIZES[0]), cloud
-    )
-    assert reading._read_known(options(files), KS[0], None, SIZES[0]) is None
-    with pytest.raises(InputError, match="--points-scale must be left out"):
-        reading._read_known(options(files, points=Path("a.BIN"), points_scale=2.0), KS[0], None, SIZES[0])
-
-
-def test_a_known_length_is_moved_to_the_undistorted_image(files):
-    given = options(files, known_length="10,7, 44,31,1.5")
-    assert reading._known_length(given, KS[0], None) == (10.0, 7.0, 44.0, 31.0, 1.5)
-    taken, coefficients = np.array([[[10.0, 7.0]], [[44.0, 31.0]]]), lens(A).coefficients
-    expected = cv2.undistortPoints(taken, KS[0], coefficients, P=KS[0])
-    found = reading._known_length(given, KS[0], lens(A))
-    np.testing.assert_allclose(found, [*expected.ravel(), 1.5], atol=1e-3)
-    assert reading._known_length(options(files), KS[0], None) is None
-    for wrong in ("1,2,3,4", "1,2,3,4,x", "1,2,3,4,5,6"):
-        with pytest.raises(InputError, match="--known-length must be X1,Y1,X2,Y2,METRES"):
-            reading._known_length(options(files, known_length=wrong), KS[0], None)
-
-
 @pytest.fixture
 def estimated(monkeypatch):
     """The arguments with which cameras would be estimated."""
     calls = []
 
-    def from_photographs(images, **given):
+    def from_unposed_images(images, **given):
         calls.append((images, given))
         views = zip(images, given["K"], ES, strict=False)
         return GeometryGuidance.from_views(list(views))
 
-    monkeypatch.setattr(reading.GeometryGuidance, "from_photographs", from_photographs)
+    monkeypatch.setattr(reading.GeometryGuidance, "from_unposed_images", from_unposed_images)
     return calls
 
 
-def test_cameras_of_photographs_without_poses_are_those_that_are_given(files, estimated, tmp_path):
+def test_a_pose_that_is_not_found_names_exif(files, monkeypatch):
+    def fails(*views, **given):
+        raise UnknownPoseError("No pose.")
+
+    monkeypatch.setattr(reading.GeometryGuidance, "from_unposed_images", fails)
+    finding = Finding("camera.from-exif", "K of a.jpg: 26 mm.")
+    monkeypatch.setattr(
+        reading, "read_cameras", lambda *given: replace(read_cameras(*given), findings=(finding,))
+    )
+    base = {"e": None, "view_e": (), "estimate_pose": True}
+    with pytest.raises(UnknownPoseError, match=r"\ANo pose\. K of a.jpg: 26 mm\. EXIF is outdated"):
+        read_pair(options(files, "third", **base, baseline=0.25))
+
+
+def test_cameras_of_images_without_poses_are_those_that_are_given(files, estimated, tmp_path):
     base = {"e": None, "view_e": (), "estimate_pose": True}
     pair = read_pair(options(files, "third", "fourth", **base, baseline=0.25, cropped=True))
     (images, given), *_ = estimated
@@ -348,7 +181,7 @@ def test_cameras_of_photographs_without_poses_are_those_that_are_given(files, es
     pair = read_pair(options(files, **base | BARE | {"view_k": ()}, fx=50.0, cy=18.0))
     _, given = estimated[-1]
     np.testing.assert_allclose(given["K"][1], [[50, 0, 29.5], [0, 50, 18], [0, 0, 1]])
-    assert len(set(pair.notes)) == 1 and pair.notes[0].code == "camera.filled-in"
+    assert [each.code for each in pair.guidance.findings].count("camera.assumed-intrinsics") == 1
 
     exif = Image.Exif()
     exif[0x8769] = {0xA405: 35}  # focal length in 35 mm equivalent
@@ -359,7 +192,7 @@ def test_cameras_of_photographs_without_poses_are_those_that_are_given(files, es
     _, given = estimated[-1]
     for K, (width, height) in zip(given["K"], SIZES, strict=False):
         assert K[0, 0] == pytest.approx(35 * np.hypot(width, height) / np.hypot(36, 24), rel=1e-6)
-    assert [note.code for note in pair.notes] == ["camera.from-exif"] * 2
+    assert [each.code for each in pair.guidance.findings].count("camera.from-exif") == 2
 
 
 def test_views_that_are_no_files_take_the_place_of_the_images(files):
@@ -370,11 +203,11 @@ def test_views_that_are_no_files_take_the_place_of_the_images(files):
     assert (pair.rig.size_left, pair.rig.size_right) == (SIZES[3], SIZES[2])
 
 
-def test_both_halves_of_one_picture_are_left_and_right(files, tmp_path):
+def test_both_halves_of_one_image_are_left_and_right(files, tmp_path):
     left = image_of(files, "left")
     both = np.concatenate([left, left[::-1]], axis=1)
     Image.fromarray(np.rint(both * 255).astype(np.uint8)).save(tmp_path / "both.png")
-    more = {"left": tmp_path / "both.png", "right": None, "side_by_side": True}
+    more = {"left": tmp_path / "both.png", "right": None, "side_by_side": "auto"}
     pair = read_pair(options(files, "third", **more))
     np.testing.assert_allclose(pair.left, left, atol=1e-6)
     np.testing.assert_allclose(pair.guidance.rights[0].permute(1, 2, 0), left[::-1], atol=1e-6)
@@ -393,32 +226,97 @@ def test_a_prior_map_and_names_for_colmap_are_read_before_the_work(files, tmp_pa
     read_pair(options(files, left=blank, export=("glb",)))
 
 
-def test_matrices_are_checked_and_named_by_their_options(files, tmp_path):
-    np.savetxt(tmp_path / "bad.txt", np.zeros((3, 3)))
-    np.save(tmp_path / "bad-pose.npy", 2 * np.eye(4))
-    for given, said in (
-        ({"k": tmp_path / "bad.txt"}, "--K"),
-        ({"k_right": tmp_path / "bad.txt"}, "--K-right"),
-        ({"e": tmp_path / "bad-pose.npy"}, "--E"),
-        ({"view_k": (tmp_path / "bad.txt",)}, f"--view-K {tmp_path / 'bad.txt'}"),
-        ({"view_e": (tmp_path / "bad-pose.npy",)}, f"--view-E {tmp_path / 'bad-pose.npy'}"),
-    ):
-        with pytest.raises(InputError) as caught:
-            read_pair(options(files, "third", **given))
-        assert said in str(caught.value)
+def test_videos_and_bags_are_opened_once_and_closed(monkeypatch):
+    opened = []
+
+    class Reader:
+        def __init__(self, *given):
+            opened.append(given)
+            self.name = str(given[0])
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            opened.append(f"{self.name} closed")
+
+        def read(self, frame):
+            return f"{self.name} {frame}" if "side" not in self.name else SimpleNamespace(frame=frame)
+
+    monkeypatch.setattr(reading.recordings, "VideoReader", Reader)
+    monkeypatch.setattr(reading.recordings, "BagReader", Reader)
+    monkeypatch.setattr(reading.Packing, "split", lambda packing, image, name: (packing.layout, image.frame))
+    given = DepthOptions(left=Path("l.mp4"), topic_left="/l", topic_right="/r", tolerance=0.25)
+    made = reading.PairReader(given)
+    assert made.frames_of(PairRef("a", Path("a.png"), Path("b.png"))) is None and opened == []
+    pair = PairRef("3", Path("l.mp4"), Path("r.mp4"), frame=3)
+    assert made.frames_of(pair) == made.frames_of(pair) == ("l.mp4 3", "r.mp4 3")
+    assert made.frames_of(replace(pair, right_frame=7)) == ("l.mp4 3", "r.mp4 7")
+    assert sorted(opened) == [(Path("l.mp4"),), (Path("r.mp4"),)]
+    assert made.frames_of(PairRef("5", Path("side.mp4"), None, frame=5)) == ("full", 5)
+    stacked = PairRef("5", Path("side.mp4"), None, frame=5, packing=reading.Packing("over-under"))
+    assert made.frames_of(stacked) == ("over-under", 5)
+    made.frames_of(PairRef("0", Path("side.mcap"), None, frame=0))
+    assert opened[-1] == (Path("side.mcap"), ("/l", "/r"), 0.25)
+    made.close()
+    assert {"l.mp4 closed", "r.mp4 closed", "side.mp4 closed", "side.mcap closed"} <= set(map(str, opened))
 
 
-@pytest.mark.filterwarnings("ignore:.*has no unit")
-def test_a_rig_is_read_for_images_that_have_other_names_in_its_calibration(files, tmp_path):
-    """Of a model with three images: the pair is the one that is named."""
-    lines = ["# Camera list", f"1 PINHOLE {SIZES[0][0]} {SIZES[0][1]} 50 50 27 20"]
-    (tmp_path / "cameras.txt").write_text("\n".join(lines) + "\n")
-    images = [f"{n} 1 0 0 0 {-0.1 * n} 0 0 1 {name}.png\n" for n, name in enumerate("abc", 1)]
-    (tmp_path / "images.txt").write_text("# Image list\n" + "\n".join(images) + "\n")
-    given = options(files, **BARE, calib=(tmp_path,))
-    rig = read_rig(given, SIZES[0], names=("a.png", "c.png"))
-    assert rig.E[0, 3] == pytest.approx(0.2) and rig.unit is None
-    assert read_rig(given, SIZES[0], names=("c.png", "b.png")).E[0, 3] == pytest.approx(-0.1)
-    renamed = replace(given, left=Path("x/b.png"), right=Path("x/a.png"))
-    assert read_rig(renamed, SIZES[0]).E[0, 3] == pytest.approx(-0.1)
-    assert rig.size_left == SIZES[0] and rig.size_right is None
+def test_a_pair_of_many_is_read_with_its_origin(files, monkeypatch):
+    given, frames = options(files, k_right=None, view_k=()), [image_of(files, "left")] * 2
+    monkeypatch.setattr(reading.PairReader, "frames_of", lambda *_: frames)
+    with reading.PairReader(given) as reader:
+        pair = reader.read(PairRef("a", given.left, given.right, frame=4), given)
+    assert pair.options is given and pair.inputs.left is frames[0]
+    assert (pair.origin.name, pair.origin.frame) == ("a", 4)
+    assert set(pair.origin.sha256) == {str(path) for path in given.read_files()}
+    assert list(pair.log.seconds) == ["calibration"]
+
+
+def write_both(files, name: str, layout: str):
+    """An image of both views ``(64, 48)``, with texture on several scales, squeezed for a layout."""
+    Image.fromarray(packed(layout, (160, 120))).save(files / name)
+    return files / name
+
+
+def read_both(files, name: str, side_by_side: str, **more):
+    given = {"left": files / name, "right": None, "side_by_side": side_by_side, **more}
+    return read_pair(DepthOptions(baseline=0.1, **given) if "fx" in more else DepthOptions(**given))
+
+
+@pytest.mark.parametrize(("layout", "by_x", "by_y"), [("half", 2, 1), ("half-over-under", 1, 2)])
+def test_k_of_squeezed_views_is_for_their_shape_before(files, layout, by_x, by_y):
+    """The views stay as they are in the file, so that K is scaled to them."""
+    write_both(files, "both.png", layout)
+    for side_by_side in (layout, "auto"):
+        pair = read_both(files, "both.png", side_by_side, fx=150.0, cx=70.0)
+        height, width = pair.left.shape[:2]
+        assert (width, height) == (160 / by_x, 120 / by_y) == pair.rig.size_left
+        K = [[150 / by_x, 0, 70.5 / by_x - 0.5], [0, 150 / by_y, 60 / by_y - 0.5], [0, 0, 1]]
+        np.testing.assert_allclose(pair.rig.K_left, K, atol=1e-9)
+        np.testing.assert_allclose(pair.rig.K_right, K, atol=1e-9)
+        codes = [finding.code for finding in pair.guidance.findings]
+        assert ("pairs.side-by-side" in codes or "pairs.layout" in codes) == (side_by_side == "auto")
+
+
+def test_cameras_for_squeezed_views_settle_an_inferred_layout(files):
+    write_both(files, "both.png", "half")
+    pair = read_both(files, "both.png", "auto", fx=75.0, fy=150.0)
+    np.testing.assert_allclose(pair.rig.K_left.diagonal(), [75, 150, 1])
+    assert any("by its cameras" in finding for finding in pair.guidance.findings)
+    with pytest.warns(UserWarning, match="pixels are usually square"):  # a given layout stays
+        pair = read_both(files, "both.png", "half", fx=75.0, fy=150.0)
+    np.testing.assert_allclose(pair.rig.K_left.diagonal(), [37.5, 150, 1])
+
+
+@pytest.mark.parametrize("layout", ["full", "half"])
+def test_the_image_size_of_a_calibration_settles_an_inferred_layout(files, layout):
+    """A view of 80 x 120 is unusual, as a full one and as a squeezed one."""
+    write_both(files, "both.png", "half")
+    width = 80 if layout == "full" else 160
+    text = f"cam0=[100 0 {width / 2}; 0 100 60; 0 0 1]\ncam1=[100 0 {width / 2}; 0 100 60; 0 0 1]\n"
+    (files / "calib.txt").write_text(f"{text}doffs=0\nbaseline=100\nwidth={width}\nheight=120\n")
+    pair = read_both(files, "both.png", "auto", calib=(files / "calib.txt",))
+    assert pair.left.shape[:2] == (120, 80) == pair.rig.size_left[::-1]
+    assert pair.rig.K_left[0, 0] == pytest.approx(100 if layout == "full" else 50)
+    assert any(f"({layout}), by its cameras" in finding for finding in pair.guidance.findings)

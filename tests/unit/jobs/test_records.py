@@ -2,13 +2,14 @@
 
 import pytest
 
-from geodiff_plugin._checks import warn
+from geodiff_plugin._internal.checks import warn
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.jobs import records
 from geodiff_plugin.jobs.records import JobLog
-from geodiff_plugin.messages import Message
+from geodiff_plugin.trust import KINDS
 
-ONE = Message("camera.filled-in", "One.")
-TWO = Message("pose.refined", "Two.")
+ONE = Finding("camera.assumed-intrinsics", "One.")
+TWO = Finding(KINDS["pose.refined"], "Two.")
 
 
 @pytest.mark.filterwarnings("ignore:One|Two")
@@ -22,7 +23,7 @@ def test_stages_are_timed_in_their_order_and_warnings_are_kept_once(monkeypatch)
         warn(TWO)
         warn(ONE)
     assert list(log.seconds.items()) == [("first", 2.5), ("second", 0.25)]
-    assert log.warnings == [ONE, TWO]
-    log.add([TWO, Message("pose.refined", "Three.")])
-    assert [str(message) for message in log.warnings] == ["One.", "Two.", "Three."]
-    assert JobLog().seconds == {} and JobLog().warnings is not JobLog().warnings
+    assert log.findings == [ONE, TWO]
+    log.add([TWO, Finding(KINDS["pose.refined"], "Three.")])
+    assert [str(finding) for finding in log.findings] == ["One.", "Two.", "Three."]
+    assert JobLog().seconds == {} and JobLog().findings is not JobLog().findings

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.jobs import results
 from geodiff_plugin.jobs.results import write_submission, write_video
 
@@ -70,7 +70,7 @@ def test_middlebury_gets_disparities_and_the_seconds_of_the_call(two):
     assert (two / "zip/training/Piano/timeMine2.txt").read_text() == "3.50\n"
 
 
-def test_a_map_with_holes_says_so_in_its_name(tmp_path):
+def test_a_map_with_holes_has_a_name_that_states_this(tmp_path):
     disparity = disparities()
     write_result(tmp_path / "out", tmp_path / "training/Piano", disparity)
     depth_m = np.load(tmp_path / "out/depth.npy")
@@ -95,7 +95,7 @@ def test_eth3d_gets_a_map_and_a_time_by_scene(two):
     assert (folder / "Piano.txt").read_text() == "runtime 3.50\n"
 
 
-def test_what_is_no_submission_is_refused(two):
+def test_a_non_submission_is_rejected(two):
     with pytest.raises(InputError, match="--method must be letters and digits"):
         write_submission([two / "out"], "middlebury", two / "zip", "my method")
     assert write_submission([two / "out"], "eth3d", two / "zip", "my method") == 2
@@ -103,11 +103,11 @@ def test_what_is_no_submission_is_refused(two):
         write_submission([two / "training"], "eth3d", two / "zip2")
     write_result(two / "again/Piano", two / "training/Piano", disparities())
     with pytest.raises(
-        InputError, match=r"out/Piano and \S*again/Piano are both of the scene \S*training/Piano"
+        InputError, match=r"out/Piano and \S*again/Piano are both results of scene \S*training/Piano"
     ):
         write_submission([two / "out", two / "again"], "eth3d", two / "zip3")
     (two / "out/Piano/report.json").write_text("{}")
-    with pytest.raises(InputError, match=r"Piano/report.json is no report"):
+    with pytest.raises(InputError, match=r"Piano/report.json is not a report"):
         write_submission([two / "out"], "eth3d", two / "zip4")
     assert not (two / "zip3").exists() and not (two / "zip4").exists()
 
@@ -119,7 +119,7 @@ def test_the_frames_of_a_video_are_maps_of_one_size_in_their_order(tmp_path, mon
         drawn.update(depths=[np.array(depth) for depth in depths_m], near=near, far=far, unit=unit)
         return iter(())
 
-    def written(out, pictures, fps):
+    def written(out, images, fps):
         drawn.update(out=out, fps=fps)
 
     monkeypatch.setattr(results.plotting, "depth_frames", note)

@@ -11,7 +11,16 @@ from PIL import Image
 from geodiff_plugin import plotting
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs import writing
-from geodiff_plugin.jobs.writing import cameras_of, pixels_of, write_into, write_maps, write_pair, write_row
+from geodiff_plugin.jobs.records import PairOrigin
+from geodiff_plugin.jobs.report import build_report
+from geodiff_plugin.jobs.writing import (
+    cameras_of,
+    pixels_of,
+    write_maps,
+    write_pair,
+    write_reprojected,
+    write_row,
+)
 from tests.unit.jobs import made_runs
 
 MIN_CONFIDENCE = 0.55
@@ -19,7 +28,7 @@ MIN_CONFIDENCE = 0.55
 
 @pytest.fixture(autouse=True)
 def plain_figures(monkeypatch):
-    """Figures as small pictures, which are quick to draw; notes what they are drawn of."""
+    """Figures as small images, which are quick to draw; notes what they are drawn of."""
     drawn = {}
 
     def note(name):
@@ -29,7 +38,7 @@ def plain_figures(monkeypatch):
 
         return draw
 
-    for name in ("depth_figure", "share_figure", "overview"):
+    for name in ("depth_figure", "fraction_figure", "overview"):
         monkeypatch.setattr(plotting, name, note(name))
     return drawn
 
@@ -66,33 +75,38 @@ def run():
 
 def test_maps_and_counts_are_those_of_the_output(run, tmp_path, plain_figures):
     output, left = run.output, run.inputs.left
-    told = write_maps(tmp_path, output, left, MIN_CONFIDENCE)
+    reported = write_maps(tmp_path, output, left, MIN_CONFIDENCE)
     depth_m, confidence = one_map(output.prediction), one_map(output.confidence)
     valid = (depth_m > 0) & (confidence > 0)
     np.testing.assert_array_equal(np.load(tmp_path / "depth.npy"), depth_m)
-    for name in ("photometric_error", "uncertainty", "confidence"):
+    for name in ("photometric_error", "uncertainty", "confidence", "sigma"):
         np.testing.assert_array_equal(np.load(tmp_path / f"{name}.npy"), one_map(getattr(output, name)), name)
     np.testing.assert_array_equal(np.load(tmp_path / "normals.npy"), output.extras["normals"][0])
     millimetres = np.asarray(Image.open(tmp_path / "depth_mm.png"))
     np.testing.assert_array_equal(millimetres, np.rint(np.where(valid, depth_m, 0) * 1000.0))
+    sigma_m, sigma_mm = one_map(output.sigma), np.asarray(Image.open(tmp_path / "sigma_mm.png"))
+    known = np.isfinite(sigma_m)
+    np.testing.assert_array_equal(known, valid)
+    assert (sigma_mm[~known] == 0).all() and (sigma_mm[known] / 1000.0 >= sigma_m[known] - 1e-6).all()
+    assert (sigma_mm[known] / 1000.0 < sigma_m[known] + 0.0011).all()
     seen = one_map(output.visible)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "visible.png")) == 255, seen)
 
     hang, doubtful = flying(depth_m), confidence < MIN_CONFIDENCE
     kept = valid & ~hang & ~doubtful
     assert hang.sum() >= 2 and 0 < kept.sum() < (valid & ~hang).sum() < valid.sum()
-    assert told == {
+    assert reported == {
         "depth_mm_zero_pixels": (millimetres == 0).sum(),
         "cloud_points": kept.sum(),
         "flying_points": hang.sum(),
-        "doubtful_points": doubtful.sum(),
+        "doubtful_points": (valid & doubtful).sum(),
         "points_out_of_reach": (~valid).sum(),
     }
     *_, (shown_left, _, _, error, _) = [plain_figures["overview"]]
     np.testing.assert_array_equal(shown_left, np.rint(left * 255).astype(np.uint8))
     assert np.isnan(error[~seen]).all()
     np.testing.assert_array_equal(error[seen], one_map(output.photometric_error)[seen])
-    np.testing.assert_array_equal(plain_figures["share_figure"][0], confidence)
+    np.testing.assert_array_equal(plain_figures["fraction_figure"][0], confidence)
     drawn, named = plain_figures["depth_figure"]
     np.testing.assert_array_equal(drawn, depth_m)
     assert named == {"unit": "m"}
@@ -109,22 +123,45 @@ def test_the_cloud_holds_the_points_that_are_kept_with_their_colours(run, tmp_pa
     cloud = trimesh.load(tmp_path / "cloud.ply")
     np.testing.assert_allclose(cloud.vertices, expected, atol=1e-5)
     np.testing.assert_array_equal(cloud.colors[:, :3], np.rint(left * 255)[v, u])
+    raw = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(raw["sigma"].ravel(), one_map(output.sigma)[v, u])
+
+
+@pytest.mark.parametrize(
+    ("kept", "limit", "count"), [(100, None, 100), (100, 100, 100), (100, 40, 40), (100, 1, 1)]
+)
+def test_a_mask_is_thinned_evenly_to_a_number_of_points(kept, limit, count):
+    mask = np.zeros((20, 30), bool)
+    mask.flat[np.random.default_rng(0).permutation(600)[:kept]] = True
+    thinned = writing._thinned(mask, limit)
+    assert thinned.sum() == count and not (thinned & ~mask).any()
+    order = np.flatnonzero(mask)
+    gaps = np.diff(np.searchsorted(order, np.flatnonzero(thinned)))
+    assert count < 2 or gaps.max() - gaps.min() <= 1, "evenly in pixel order"
 
 
 def test_an_output_without_a_second_view_writes_what_it_has(tmp_path, plain_figures):
     alone = made_runs.output(
         visible=None, photometric_error=None, confidence=None, uncertainty=None, extras={}, unit=None
     )
-    told = write_maps(tmp_path, alone, made_runs.run().inputs.left, 0.9)
+    reported = write_maps(tmp_path, alone, made_runs.run().inputs.left)
     depth_m = one_map(alone.prediction)
     assert {path.name for path in tmp_path.iterdir()} == {
         *("depth.npy", "depth_mm.png", "depth.png", "overview.png", "cloud.ply")
     }
-    assert told["doubtful_points"] == 0 and told["points_out_of_reach"] == (depth_m == 0).sum()
-    assert told["cloud_points"] == ((depth_m > 0) & ~flying(depth_m)).sum()
+    assert reported["doubtful_points"] == 0 and reported["points_out_of_reach"] == (depth_m == 0).sum()
+    assert reported["cloud_points"] == ((depth_m > 0) & ~flying(depth_m)).sum()
     assert plain_figures["overview"][2:4] == (None, None)
     assert plain_figures["depth_figure"][1] == {"unit": None}
     assert b"metre" not in (tmp_path / "cloud.ply").read_bytes()[:400]
+
+
+def test_a_result_of_holes_only_is_written(run, tmp_path):
+    empty = run.output.with_holes(max_sigma=1e-9)
+    counts = write_maps(tmp_path, empty, run.inputs.left)
+    assert counts["cloud_points"] == 0 and counts["points_out_of_reach"] == empty.prediction.size
+    assert not np.load(tmp_path / "depth.npy").any() and np.isnan(np.load(tmp_path / "sigma.npy")).all()
+    assert build_report(replace(run, output=empty))["sigma_median_m"] is None
 
 
 def test_pixels_of_a_cloud_are_valid_confident_and_do_not_fly(run):
@@ -138,8 +175,14 @@ def test_pixels_of_a_cloud_are_valid_confident_and_do_not_fly(run):
     assert shown.image_01 is run.inputs.left and shown.K.dtype == np.float64
     v, u = np.argwhere(confidence == np.float32(least))[0]
     assert shown.valid[v, u] or flying(depth_m)[v, u] or not depth_m[v, u] > 0
-    bare = pixels_of(replace(run.output, confidence=None), run.inputs.left, 0.99)
-    np.testing.assert_array_equal(bare.valid, (depth_m > 0) & ~flying(depth_m))
+    bare = replace(run.output, confidence=None)
+    everything = pixels_of(bare, run.inputs.left)
+    np.testing.assert_array_equal(everything.valid, (depth_m > 0) & ~flying(depth_m))
+    assert not pixels_of(bare, run.inputs.left, 0.01).valid.any(), "no depth is known to be that sure"
+    sigma_m = one_map(run.output.sigma)
+    largest = float(np.nanmedian(sigma_m))
+    precise = pixels_of(run.output, run.inputs.left, 0.0, largest)
+    np.testing.assert_array_equal(precise.valid, (sigma_m <= largest) & ~flying(depth_m))
 
 
 @pytest.mark.parametrize("rescaled", [1.0, 2.5])
@@ -158,9 +201,9 @@ def test_cameras_of_all_views_are_in_the_unit_of_the_depth(run, rescaled):
             np.testing.assert_array_equal(camera.E[3], [0, 0, 0, 1])
 
 
-def write(run, folder: Path, **entries):
+def write(run, folder: Path):
     with OutFolder(folder) as out:
-        return write_pair(out, run, **entries)
+        return write_pair(out, run)
 
 
 @pytest.mark.parametrize("rescaled", [1.0, 2.5])
@@ -233,48 +276,53 @@ def test_depth_in_another_camera_is_that_of_the_same_points(tmp_path):
     normal, offset = np.array([0.1, -0.05, 1.0]), 2.5  # n . x = d
     v, u = np.mgrid[:60, :80]
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
-    told = write_into(tmp_path, (offset / (rays @ normal)).astype(np.float32), K, path)
+    reported = write_reprojected(tmp_path, (offset / (rays @ normal)).astype(np.float32), K, path)
     E, K_into = np.array(camera["E"]), np.array(camera["K"], float)
     v, u = np.mgrid[:24, :28]
     rays = np.stack([u, v, np.ones(u.shape)], -1) @ np.linalg.inv(K_into).T @ E[:3, :3].T
     expected = (offset - normal @ E[:3, 3]) / (rays @ normal)
-    seen_m = np.load(tmp_path / "depth_into.npy")
+    seen_m = np.load(tmp_path / "depth_reprojected.npy")
     assert seen_m.shape == (24, 28) and (seen_m > 0).mean() > 0.6
     np.testing.assert_allclose(seen_m[seen_m > 0], expected[seen_m > 0], rtol=5e-3)
-    millimetres = np.asarray(Image.open(tmp_path / "depth_into_mm.png"))
+    millimetres = np.asarray(Image.open(tmp_path / "depth_reprojected_mm.png"))
     np.testing.assert_array_equal(millimetres, np.rint(seen_m.astype(float) * 1000))
     known = round((seen_m > 0).sum() / seen_m.size, 4)
-    np.testing.assert_allclose(told.pop("E"), E, atol=1e-9)  # its rotation is made exactly orthogonal
-    assert told == {"K": K_into.tolist(), "size": [28, 24], "known_share": known}
+    np.testing.assert_allclose(reported.pop("E"), E, atol=1e-9)  # its rotation is made exactly orthogonal
+    assert reported == {"K": K_into.tolist(), "size": [28, 24], "known_fraction": known}
 
 
 def test_a_pair_is_written_with_all_that_its_options_ask_for(run, tmp_path):
-    options = replace(run.options, into=target(tmp_path), min_confidence=MIN_CONFIDENCE)
-    result = write(replace(run, options=options), tmp_path / "out", pair={"name": "a"}, note=7)
+    options = replace(run.options, reproject=target(tmp_path), min_confidence=MIN_CONFIDENCE)
+    origin = PairOrigin("a", 7, {"a.png": "digest"})
+    result = write(replace(run, options=options, origin=origin), tmp_path / "out")
     assert result.folder == tmp_path / "out" and result.run.output is run.output
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert report == json.loads(json.dumps(result.report))
-    assert report["pair"] == {"name": "a"} and report["note"] == 7
+    assert report["pair"] == {"name": "a", "frame": 7, "sha256": {"a.png": "digest"}}
     assert sorted(report["files"]["names"]) == sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert report["files"]["doubtful_points"] == (one_map(run.output.confidence) < MIN_CONFIDENCE).sum()
+    confidence = one_map(run.output.confidence)
+    doubtful = one_map(run.output.valid) & (confidence < MIN_CONFIDENCE)
+    assert report["files"]["doubtful_points"] == doubtful.sum()
     assert list(report["seconds"]) == ["calibration", "guided call", "write"]
     assert report["seconds"]["calibration"] == 0.125 and report["seconds"]["guided call"] == 2.5
     assert not (tmp_path / "out/undistorted.png").exists()
     valid = one_map(run.output.valid)
-    expected = write_into(tmp_path, one_map(run.output.prediction) * valid, made_runs.K_LEFT, options.into)
-    assert report["into"] == expected
-    into = [np.load(folder / "depth_into.npy") for folder in (tmp_path, tmp_path / "out")]
+    expected = write_reprojected(
+        tmp_path, one_map(run.output.prediction) * valid, made_runs.K_LEFT, options.reproject
+    )
+    assert report["reproject"] == expected
+    into = [np.load(folder / "depth_reprojected.npy") for folder in (tmp_path, tmp_path / "out")]
     np.testing.assert_array_equal(*into)
 
 
 def test_the_row_of_a_pair_is_that_of_the_report_which_is_written(run, tmp_path):
     with OutFolder(tmp_path / "out") as out:
-        row = write_row(out, run, {"pair": {"name": "b"}})
+        row = write_row(out, run)
     report = json.loads((tmp_path / "out/report.json").read_text())
-    assert report["pair"]["name"] == "b"
+    assert "pair" not in report
     assert (row["near_m"], row["median_m"], row["far_m"]) == tuple(
         report["depth"][f"{name}_m"] for name in ("min", "median", "max")
     )
     assert row["seconds"] == pytest.approx(sum(report["seconds"].values()), abs=1e-3)
-    assert row["verdict"] == "not trusted" and row["message"] == made_runs.WARNED
-    assert writing.INTO == ("depth_into.npy", "depth_into_mm.png")
+    assert row["verdict"] == "not trusted" and row["message"] == f"{made_runs.REMARK} {made_runs.WARNED}"
+    assert writing.REPROJECTED_FILES == ("depth_reprojected.npy", "depth_reprojected_mm.png")

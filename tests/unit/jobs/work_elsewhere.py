@@ -4,15 +4,15 @@ import errno
 import os
 import time
 
-from geodiff_plugin._checks import warn
+from geodiff_plugin._internal.checks import warn
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.jobs.failures import full_disk
 from geodiff_plugin.jobs.journal import Item
-from geodiff_plugin.jobs.separate import ProcessEnded
-from geodiff_plugin.messages import Message
+from geodiff_plugin.jobs.processes import ProcessEnded
 
 
 def by_process(item: Item) -> dict:
-    """Do what the payload says."""
+    """Execute the payload."""
     if item.payload == "sleeps":
         time.sleep(600)
     if item.payload == "defect":
@@ -40,7 +40,7 @@ def fails_in_its_own_way(full: bool) -> None:
 
 
 def warns(where: str) -> str:
-    warn(Message("camera.filled-in", f"cy is assumed in {where}."))
+    warn(Finding("camera.assumed-intrinsics", f"cy is assumed in {where}."))
     print("a library prints")
     return where
 

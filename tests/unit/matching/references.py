@@ -5,7 +5,8 @@ import torch
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.cameras import View
+from tests.views import view_of
 
 #: Cost where no right view sees a pixel, and the largest cost.
 UNSEEN, LARGEST = 78, 224
@@ -23,9 +24,9 @@ def right_from_left(angles_deg, centre) -> np.ndarray:
     return T
 
 
-def view_of(image: np.ndarray, K: np.ndarray, T: np.ndarray) -> CameraView:
+def grey_view(image: np.ndarray, K: np.ndarray, T: np.ndarray) -> View:
     """A grey right view of an image ``(H, W)``."""
-    return CameraView(*(torch.from_numpy(np.asarray(x)).float() for x in (image[None], K, T)))
+    return view_of(torch.from_numpy(np.asarray(image)[None]).float(), K, T)
 
 
 def projected(columns, rows, inverse_depth: float, K: np.ndarray, K_right: np.ndarray, T: np.ndarray):
@@ -106,10 +107,10 @@ def positions(total: np.ndarray) -> np.ndarray:
     return found
 
 
-def window_mean(values: np.ndarray, reach: int) -> np.ndarray:
+def window_mean(values: np.ndarray, radius: int) -> np.ndarray:
     """Mean over the part of a square window that lies inside the map ``(H, W)``."""
     found = np.zeros(values.shape)
     for v, u in np.ndindex(*values.shape):
-        window = values[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1]
+        window = values[max(v - radius, 0) : v + radius + 1, max(u - radius, 0) : u + radius + 1]
         found[v, u] = window.mean()
     return found

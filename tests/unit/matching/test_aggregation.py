@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.matching.aggregation import Buffers, aggregate, empty_volume, jump_penalties
+from geodiff_plugin.matching.aggregation import aggregate, jump_penalties
+from geodiff_plugin.matching.volume import Buffers, empty_volume
 from tests.unit.matching import references as ref
 
 AXES = [(1, 0), (0, 1), (1, 1), (1, -1)]
@@ -20,6 +21,20 @@ def test_a_jump_costs_less_at_an_edge_of_the_image_along_any_axis(size):
         np.testing.assert_allclose(penalty, ref.jump_penalties(grey, *axis), atol=1)
         assert (penalty == ref.jump_penalties(grey, *axis)).mean() > 0.97
     assert found.max() == 269 and found.min() >= 67
+
+
+def test_no_path_runs_through_invalid_pixels():
+    """Costs beyond a band of NaN do not change the sums on this side of it."""
+    rng = np.random.default_rng(2)
+    grey = torch.from_numpy(rng.random((9, 14))).float()
+    grey[:, 6:8] = torch.nan
+    levels = torch.from_numpy(rng.integers(0, 224, (13, 9, 14)).astype(np.uint8))
+    levels[:, :, 6:8] = 78
+    other = levels.clone()
+    other[:, :, 8:] = torch.from_numpy(rng.integers(0, 224, (13, 9, 6)).astype(np.uint8))
+    one, two = (aggregate(each, grey).clone() for each in (levels, other))
+    assert torch.equal(one[..., :6], two[..., :6]) and not torch.equal(one[..., 8:], two[..., 8:])
+    assert (jump_penalties(grey, AXES)[1][:, 6:9] == 0).all()
 
 
 @pytest.mark.parametrize("size", [(13, 9, 14), (13, 14, 9), (3, 1, 6), (3, 6, 1), (1, 5, 4)])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_view, even_shifts
 from geodiff_plugin.matching.census import census, grey_levels
 from tests.unit.matching import references as ref
@@ -12,6 +13,7 @@ SIZE, SIZE_RIGHT = (40, 56), (50, 44)
 K = ref.matrix(61.0, 55.0, 26.0, 21.5, 1.5)
 K_RIGHT = ref.matrix(48.0, 66.0, 20.0, 27.0, -2.0)
 #: A plane at infinity first, then some that are not evenly spaced.
+LEFT = Camera(K, SIZE[::-1])
 PLANES = np.array([0.0, 0.1, 0.25, 0.4, 0.7])
 POSES = [
     ref.right_from_left((4.0, -6.0, 9.0), (0.25, -0.1, 0.2)),
@@ -20,12 +22,11 @@ POSES = [
 
 
 def aligned(image: np.ndarray, T: np.ndarray, K_right: np.ndarray = K_RIGHT) -> AlignedView:
-    left_K, planes = torch.from_numpy(K).float(), torch.from_numpy(PLANES).float()
-    return align_view(ref.view_of(image, K_right, T), left_K, SIZE, planes)
+    return align_view(ref.grey_view(image, K_right, T), LEFT, torch.from_numpy(PLANES).float())
 
 
 def ramps() -> tuple[np.ndarray, np.ndarray]:
-    """Two right images whose brightness says in which column and in which row a pixel is."""
+    """Two right images whose brightness is the column and the row of a pixel."""
     rows, columns = np.mgrid[: SIZE_RIGHT[0], : SIZE_RIGHT[1]]
     return 0.1 + columns / 100, 0.1 + rows / 100
 
@@ -90,9 +91,9 @@ def test_a_canvas_is_valid_inside_the_right_image_and_covers_it_as_far_as_the_pl
 
 def test_a_canvas_is_at_most_three_left_grids_wide_and_never_empty():
     """Cameras so near to each other's axes that planes spread far, and one that looks past the left grid."""
-    wide = ref.view_of(np.full((300, 400), 0.5), ref.matrix(30.0, 30.0, 200.0, 150.0), POSES[0])
+    wide = ref.grey_view(np.full((300, 400), 0.5), ref.matrix(30.0, 30.0, 200.0, 150.0), POSES[0])
     planes = torch.tensor([0.0, 2.0, 4.6])
-    view = align_view(wide, torch.from_numpy(K).float(), SIZE, planes)
+    view = align_view(wide, LEFT, planes)
     last = np.array([SIZE[1] - 1, SIZE[0] - 1])
     low = -view.shift[0]
     high = low + np.array(view.size[::-1]) - 1
@@ -102,17 +103,15 @@ def test_a_canvas_is_at_most_three_left_grids_wide_and_never_empty():
     for yaw, pitch in ((50.0, 0.0), (-50.0, 0.0), (0.0, 45.0), (0.0, -45.0)):
         T = ref.right_from_left((pitch, yaw, 0.0), (0.2, 0.0, 0.0))
         near_infinity = torch.tensor([0.0, 0.1])
-        away = align_view(
-            ref.view_of(np.full(SIZE, 0.5), narrow, T), torch.from_numpy(K).float(), SIZE, near_infinity
-        )
+        away = align_view(ref.grey_view(np.full(SIZE, 0.5), narrow, T), LEFT, near_infinity)
         axis = 0 if yaw else 1
         assert away.size[1 - axis] == 2
 
 
 def test_a_canvas_without_a_plane_in_front_of_the_right_camera_covers_the_left_grid():
     T = ref.right_from_left((2.0, 3.0, -4.0), (0.0, 0.1, 1.0))
-    view = ref.view_of(np.full(SIZE_RIGHT, 0.5), ref.matrix(20.0, 20.0, 22.0, 25.0), T)
-    made = align_view(view, torch.from_numpy(K).float(), SIZE, torch.tensor([1.0, 1.5, 3.0]))
+    view = ref.grey_view(np.full(SIZE_RIGHT, 0.5), ref.matrix(20.0, 20.0, 22.0, 25.0), T)
+    made = align_view(view, LEFT, torch.tensor([1.0, 1.5, 3.0]))
     assert made.size == SIZE and not made.scale.any()
 
 
@@ -127,7 +126,7 @@ def test_depth_over_depth_is_the_scale_and_planes_behind_the_right_camera_have_n
     """The right camera is half a metre ahead: planes at 0.5 m and nearer are behind it."""
     T = ref.right_from_left((3.0, 5.0, -8.0), (0.1, 0.05, 0.5))
     planes = torch.tensor([0.0, 0.5, 1.5, 1.94, 1.97, 2.0, 2.5])
-    view = align_view(ref.view_of(ramps()[0], K_RIGHT, T), torch.from_numpy(K).float(), SIZE, planes)
+    view = align_view(ref.grey_view(ramps()[0], K_RIGHT, T), LEFT, planes)
     depth_ratio = 1 - 0.5 * planes.numpy()
     expected = np.where(depth_ratio > 0.02, 1 / np.where(depth_ratio > 0.02, depth_ratio, 1), 0.0)
     np.testing.assert_allclose(view.scale, expected, rtol=1e-5)
@@ -192,7 +191,7 @@ def test_costs_and_visible_pixels_of_every_plane_equal_a_warp_by_that_plane(make
         # The margin of the left grid repeats its outermost lines.
         wide = (np.pad(lines, 3, mode="edge") for lines in (rows, columns))
         expected = ref.cost(described, ref.votes(ref.sampled(canvas, *wide)))
-        inner = slice(3, width - 3)  # plain shifts have the true columns beside the grid
+        inner = slice(3, width - 3)  # plain shifts have the true columns next to the grid
         error = np.abs(compared.cost(k).numpy().astype(int) - expected)[:, inner]
         assert error.max() <= 3 and error.mean() < 0.05
         inside = [

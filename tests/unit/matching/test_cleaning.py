@@ -1,4 +1,4 @@
-"""JPEG blocks and noise: found for each photograph of a batch, and removed as by SciPy's DCT."""
+"""JPEG blocks and noise: found for each image of a batch, and removed as by SciPy's DCT."""
 
 import io
 
@@ -8,8 +8,18 @@ import torch
 from PIL import Image
 from scipy.fft import dctn, idctn
 
-from geodiff_plugin.matching import cleaning
+from geodiff_plugin import GuidanceConfig
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.evidence.inputs import Inputs
+from geodiff_plugin.evidence.prepare import pinhole, plan_evidence
+from geodiff_plugin.formats.lenses import distortion_from_text, undistorted
+from geodiff_plugin.matching import build_cost_volume, cleaning, match_volume
+from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.cleaning import Flaws, clean, find_flaws
+from tests.scenes import SyntheticPair, render_pair
+from tests.views import posed_of, view_of
+
+END_TO_END = pytest.mark.end_to_end
 
 
 def quantization(quality: int) -> np.ndarray:
@@ -19,8 +29,8 @@ def quantization(quality: int) -> np.ndarray:
         return np.array(Image.open(buffer).quantization[0]).reshape(8, 8)
 
 
-def photograph(seed: int, size=(168, 200), falls: float = 1.6) -> np.ndarray:
-    """Grey levels with detail of all sizes, the fine one faint as in photographs."""
+def photo(seed: int, size=(168, 200), falls: float = 1.6) -> np.ndarray:
+    """Grey levels with detail of all sizes, the fine one faint as in images."""
     rng = np.random.default_rng(seed)
     spectrum = np.fft.rfft2(rng.normal(size=size))
     frequency = np.hypot(np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1]))
@@ -62,14 +72,14 @@ def jpeg_scale(levels: np.ndarray, row: int, column: int) -> float:
     return middle if sum(abs(scale / middle - 1) < 0.3 for scale in found) >= 5 else 0.0
 
 
-def test_every_photograph_of_a_batch_has_the_scale_of_its_own_table_wherever_its_blocks_begin():
+def test_every_image_of_a_batch_has_the_scale_of_its_own_table_wherever_its_blocks_begin():
     """Crops that begin within a block, by different rows and columns; the last one was never compressed."""
     qualities, corners = (20, 30, 75, 90), ((0, 0), (3, 6), (7, 1), (5, 4))
     crops = [
-        compressed(photograph(n), quality)[row : row + 144, column : column + 176]
+        compressed(photo(n), quality)[row : row + 144, column : column + 176]
         for n, (quality, (row, column)) in enumerate(zip(qualities, corners, strict=True))
     ]
-    never = photograph(9)[:144, :176]
+    never = photo(9)[:144, :176]
     found = flaws_of(*crops, never)
     for image, flaws, quality, (row, column) in zip(crops, found, qualities, corners, strict=False):
         expected = jpeg_scale(image, -row % 8, -column % 8)
@@ -112,8 +122,8 @@ def test_five_coefficients_have_to_agree_on_a_scale(scales, agreed):
     assert cleaning._scale(np.array(scales)) == agreed
 
 
-def test_of_a_large_photograph_some_blocks_are_read_and_the_fewer_ones_of_another_are_not_padded(monkeypatch):
-    monkeypatch.setattr(cleaning, "_MOST_BLOCKS", 50)
+def test_some_blocks_of_a_large_image_are_read_and_the_fewer_ones_of_another_are_not_padded(monkeypatch):
+    monkeypatch.setattr(cleaning, "_MAX_BLOCKS", 50)
     levels = np.random.default_rng(0).random((2, 75, 90)).astype(np.float32)
     begins = np.array([[3, 2], [0, 7]])
     found = cleaning._some_blocks(torch.from_numpy(levels), begins).numpy()
@@ -130,7 +140,7 @@ def test_of_a_large_photograph_some_blocks_are_read_and_the_fewer_ones_of_anothe
         assert not blocks[len(expected) :].any()
 
 
-def test_the_noise_of_each_photograph_is_read_from_its_own_flattest_blocks():
+def test_the_noise_of_each_image_is_measured_in_its_own_flattest_blocks():
     rng = np.random.default_rng(1)
     noises = (1.0, 4.0, 9.0)
     smooth = [np.add.outer(np.linspace(60, 120, 165), np.linspace(-20, 40, 218)) for _ in noises]
@@ -140,7 +150,7 @@ def test_the_noise_of_each_photograph_is_read_from_its_own_flattest_blocks():
     for flaws, sigma in zip(flaws_of(*images), noises, strict=True):
         assert flaws.noise == pytest.approx(sigma, rel=0.08)
     textured = images[1].copy()
-    textured[:, 120:] += 40 * (rng.random((165, 98)) - 0.5)  # in a part of the picture only
+    textured[:, 120:] += 40 * (rng.random((165, 98)) - 0.5)  # in a part of the image only
     (flaws,) = flaws_of(textured)
     assert flaws.noise == pytest.approx(4.0, rel=0.25)
     blocks = textured[:160, :216].reshape(20, 8, 27, 8).swapaxes(1, 2)
@@ -190,7 +200,7 @@ def thresholded(levels: np.ndarray, threshold: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("size", [(40, 56), (37, 50), (41, 63)])
 def test_small_coefficients_are_removed_as_by_scipys_transform(monkeypatch, at_once, size):
     monkeypatch.setattr(cleaning, "launch_bound", lambda _: at_once)
-    levels = photograph(2, size) + np.random.default_rng(3).normal(0, 6, size)
+    levels = photo(2, size) + np.random.default_rng(3).normal(0, 6, size)
     threshold = cleaning._threshold(Flaws(0.5, 5.0))
     found = cleaning._without(torch.from_numpy(levels).float(), threshold)
     np.testing.assert_allclose(found, thresholded(levels, threshold), atol=2e-3)
@@ -199,14 +209,14 @@ def test_small_coefficients_are_removed_as_by_scipys_transform(monkeypatch, at_o
 def test_each_image_of_a_list_is_cleaned_by_its_own_flaws_and_keeps_its_colours():
     rng = np.random.default_rng(4)
     size, other = (120, 152), (136, 128)
-    colour = np.stack([photograph(5, size, 2.0)] * 3) * np.array([1.0, 0.8, 0.9])[:, None, None]
+    colour = np.stack([photo(5, size, 2.0)] * 3) * np.array([1.0, 0.8, 0.9])[:, None, None]
     images = [
         colour,
         colour + rng.normal(0, 5, size),
-        compressed(photograph(6, other), 40)[None],
-        compressed(photograph(7, size), 30)[None],
+        compressed(photo(6, other), 40)[None],
+        compressed(photo(7, size), 30)[None],
         colour + rng.normal(0, 12, size),
-        photograph(8, (300, 280))[None] + rng.normal(0, 9, (300, 280)),
+        photo(8, (300, 280))[None] + rng.normal(0, 9, (300, 280)),
     ]
     given = [torch.from_numpy(np.clip(image / 255, 0, 1)).float() for image in images]
     found = clean(given, 5000)  # six times as many pixels as that are too many for the last one
@@ -222,3 +232,76 @@ def test_each_image_of_a_list_is_cleaned_by_its_own_flaws_and_keeps_its_colours(
     assert (
         clean(given[1:2], int(least))[0] is not given[1] and clean(given[1:2], int(least) - 1)[0] is given[1]
     )
+
+
+GRID = 210_000
+
+
+@pytest.fixture(scope="module")
+def pair() -> SyntheticPair:
+    return render_pair(3, "terrain", size=(240, 320))
+
+
+def compressed_of_cleaning(image_01: torch.Tensor, quality: int) -> torch.Tensor:
+    levels = (image_01 * 255).round().byte().permute(1, 2, 0).numpy()
+    with io.BytesIO() as buffer:
+        Image.fromarray(levels).save(buffer, "JPEG", quality=quality)
+        return torch.from_numpy(np.array(Image.open(buffer))).permute(2, 0, 1).float() / 255
+
+
+def noisy(image_01: torch.Tensor, levels: float) -> torch.Tensor:
+    noise = torch.randn(image_01.shape[1:], generator=torch.Generator().manual_seed(0))
+    return (image_01 + noise * levels / 255).clamp(0, 1)
+
+
+@END_TO_END
+@pytest.mark.parametrize("channels", [1, 3])
+def test_noise_is_found_and_removed_and_a_clean_image_is_unchanged(
+    pair: SyntheticPair, channels: int
+) -> None:
+    scene = pair.left.image_01[:channels]
+    before = noisy(scene, 6.0)
+    (after,) = clean([before], GRID)
+    assert find_flaws(255 * grey(before))[0].noise == pytest.approx(6.0, rel=0.25)
+    assert float((after - scene).square().mean()) < 0.5 * float((before - scene).square().mean())
+    assert clean([scene], GRID)[0] is scene
+    assert clean([before], before[0].numel() // 6 - 1)[0] is before  # it is shrunk anyway
+
+
+@END_TO_END
+@pytest.mark.parametrize("flawed", [lambda x: compressed_of_cleaning(x, 40), lambda x: noisy(x, 8.0)])
+def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
+    T, left, right = torch.linalg.inv(pair.E), flawed(pair.left.image_01), flawed(pair.right.image_01)
+
+    def wrong(images: tuple[torch.Tensor, torch.Tensor]) -> float:
+        posed = posed_of(images[0], pair.K_left, (images[1], pair.K_right, T))
+        matches = match_volume(build_cost_volume(posed))
+        ground_truth, seen = 1.0 / pair.left.depth_m, torch.isfinite(pair.left.depth_m) & ~pair.occluded
+        off = ((matches.inverse_depth - ground_truth).abs() / matches.plane_step > 1.5) * matches.confidence
+        return float(off[seen].sum() / matches.confidence[seen].sum())
+
+    cleaned = clean([left], GRID)[0], clean([right], GRID)[0]
+    assert wrong(cleaned) < 0.9 * wrong((left, right))
+    view = view_of(right, pair.K_right, T)
+    config = GuidanceConfig(pose="given")
+    made = plan_evidence(left, Inputs(Camera(pair.K_left.numpy()), (view,), (), None), config).evidence
+    assert torch.equal(made.native.left.image_01, cleaned[0])
+    assert torch.equal(made.native.rights[0].image_01, cleaned[1])
+
+
+@END_TO_END
+def test_an_image_is_cleaned_before_it_is_undistorted(pair: SyntheticPair) -> None:
+    """Afterwards its blocks stand nowhere near a multiple of 8 pixels, and are not found."""
+    blocky, lens = compressed_of_cleaning(pair.left.image_01, 30), distortion_from_text("-0.2,0.05,0,0")
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+
+    def straight(image_01: torch.Tensor) -> np.ndarray:
+        return undistorted(image_01.permute(1, 2, 0).contiguous().numpy(), Camera(K, lens=lens))
+
+    given = blocky.permute(1, 2, 0).contiguous().numpy()
+    np.testing.assert_array_equal(
+        pinhole(given, Camera(K, lens=lens), GuidanceConfig()), straight(clean([blocky], GRID)[0])
+    )
+    off = GuidanceConfig(clean_images=False)
+    np.testing.assert_array_equal(pinhole(given, Camera(K, lens=lens), off), straight(blocky))
+    assert pinhole(given, Camera(K), GuidanceConfig()) is given

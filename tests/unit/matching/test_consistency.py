@@ -6,19 +6,22 @@ import numpy as np
 import pytest
 import torch
 
+from geodiff_plugin.cameras import PosedViews
 from geodiff_plugin.matching import consistency
 from geodiff_plugin.matching.consistency import (
     candidates,
+    known_fraction,
     known_shape,
-    known_share,
     match_volume,
+    view_evidence,
     window_mean,
 )
 from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
-from geodiff_plugin.types import PosedViews
+from geodiff_plugin.matching.sweep import sweep_planes
+from geodiff_plugin.matching.volume import CostVolume
 from tests.tiny import render_plane
 from tests.unit.matching import references as ref
+from tests.views import view_of
 
 SIZE = (34, 47)
 K = ref.matrix(58.0, 52.0, 22.0, 18.0)
@@ -38,11 +41,11 @@ def volume() -> CostVolume:
         image = render_plane(K_view, np.linalg.inv(T), size, normal, offset, seed=3)[0]
         faded = 1 / (1 + np.exp(np.linspace(-6, 20, size[0])))[:, None]
         images.append(0.5 + faded * (image.mean(-1) / 255.0 - 0.5))
-    views = tuple(ref.view_of(image, *camera[1:]) for image, camera in zip(images[1:], CAMERAS, strict=True))
-    left = torch.from_numpy(images[0][None]).float()
-    return sweep_planes(
-        PosedViews(left, views, torch.from_numpy(K).float()), torch.from_numpy(PLANES).float()
+    views = tuple(
+        ref.grey_view(image, *camera[1:]) for image, camera in zip(images[1:], CAMERAS, strict=True)
     )
+    left = torch.from_numpy(images[0][None]).float()
+    return sweep_planes(PosedViews(view_of(left, K), views), torch.from_numpy(PLANES).float())
 
 
 def right_positions(volume: CostVolume, v: int) -> np.ndarray:
@@ -78,14 +81,14 @@ def test_confidence_and_deviation_of_matches_follow_from_their_evidence(volume):
     total = ref.aggregated(volume.levels.numpy(), volume.left_01[0].numpy())
     position, best = ref.positions(total), total.min(0)
     index, number = total.argmin(0), np.arange(len(total))[:, None, None]
-    runner_up = np.where(abs(number - index) > 1, total, 10**6).min(0)
+    second_best = np.where(abs(number - index) > 1, total, 10**6).min(0)
     levels, seen = volume.levels.numpy().astype(float), volume.in_view.numpy()
     own = np.take_along_axis(levels, index[None], 0)[0]
     gain = np.maximum((levels * seen).sum(0) / np.maximum(seen.sum(0), 1) - own, 0) / 224
     sides = [np.take_along_axis(levels, (index + by).clip(0, len(total) - 1)[None], 0)[0] for by in (-4, 4)]
     contrast, sharpness = (ref.window_mean(x, 15) for x in (gain, (sum(sides) / 2 - own) / 224))
     cost = (best / (4 * 224)).clip(0, 0.8)
-    margin = ((runner_up - best) / (4 * 224)).clip(0, 0.5)
+    margin = ((second_best - best) / (4 * 224)).clip(0, 0.5)
     differences = [left_right_difference(volume, v, position) for v in range(2)]
     confidence = np.zeros(SIZE)
     for difference in differences:
@@ -102,10 +105,10 @@ def test_confidence_and_deviation_of_matches_follow_from_their_evidence(volume):
         assert (np.abs(ours.numpy() - theirs) > 1e-3 * (1 + theirs)).mean() < 0.005
     assert all(np.isinf(d).any() and (d < 1.5).mean() > 0.3 and (d > 1.5).any() for d in differences)
     assert (confidence > 0.5).mean() > 0.3 and (deviation > 5).any() and (contrast < 0.03).any()
-    made = candidates(volume, volume.aligned)
-    np.testing.assert_allclose(made.contrast, contrast, atol=1e-5)
-    np.testing.assert_allclose(made.sharpness, sharpness, atol=1e-5)
-    for evidence, difference in zip(made.views, differences, strict=True):
+    winners, means, others = candidates(volume)
+    np.testing.assert_allclose(means, [contrast, sharpness], atol=1e-5)
+    for view, other, difference in zip(volume.aligned, others, differences, strict=True):
+        evidence = view_evidence(view, other, winners)
         features = np.stack([np.ones(SIZE), np.log(margin + 0.03), cost, np.minimum(difference, 1.5)])
         assert (np.abs(evidence.features.numpy() - features) > 1e-3).mean() < 0.005
         assert (np.isfinite(evidence.difference.numpy()) != np.isfinite(difference)).mean() < 0.005
@@ -133,12 +136,12 @@ def test_the_plane_is_found_in_metres_and_the_order_of_the_views_does_not_matter
     assert all((each < found.confidence).any() for each in alone)
 
 
-@pytest.mark.parametrize("reach", [1, 4])
-def test_the_mean_of_a_window_counts_what_lies_inside_the_image(reach):
+@pytest.mark.parametrize("radius", [1, 4])
+def test_the_mean_of_a_window_counts_what_lies_inside_the_image(radius):
     maps = np.random.default_rng(0).random((2, 3, 7, 11))
-    found = window_mean(torch.from_numpy(maps), reach)
+    found = window_mean(torch.from_numpy(maps), radius)
     for index in np.ndindex(2, 3):
-        np.testing.assert_allclose(found[index], ref.window_mean(maps[index], reach), rtol=1e-6)
+        np.testing.assert_allclose(found[index], ref.window_mean(maps[index], radius), rtol=1e-6)
 
 
 def batch() -> Matches:
@@ -159,18 +162,24 @@ def mean_precision(matches: Matches, image: int, least: float) -> np.ndarray:
 
 def test_what_is_known_around_every_pixel_is_the_mean_precision_of_its_own_image():
     matches = batch()
-    share = known_share(matches)
+    fraction = known_fraction(matches)
     surface = torch.from_numpy(np.random.default_rng(2).uniform(0.02, 1.5, (2, 1, 40, 37))).float()
     shape = known_shape(matches, surface)
     for image, step in enumerate((0.01, 0.023)):
         expected = np.minimum(mean_precision(matches, image, 1.0), 1)
-        np.testing.assert_allclose(share[image, 0], expected, rtol=1e-4)
+        np.testing.assert_allclose(fraction[image, 0], expected, rtol=1e-4)
         near = np.minimum(surface[image, 0].numpy() / step / 50, 1)
         expected = np.minimum(mean_precision(matches, image, 0.5) * near, 1)
         np.testing.assert_allclose(shape[image, 0], expected, rtol=1e-4)
-        assert (share[image] < 1).any()
+        assert (fraction[image] < 1).any()
     assert (shape < 1).any() and (shape[1] == 1).any()
     unknown = Matches(matches.inverse_depth, matches.confidence, matches.plane_step)
-    assert (known_share(unknown) == 1).all()
+    assert (known_fraction(unknown) == 1).all()
     near = (surface / torch.tensor([0.01, 0.023]).view(-1, 1, 1, 1) / 50).clamp_max(1)
     torch.testing.assert_close(known_shape(unknown, surface), near)
+
+
+def test_what_is_known_without_deviations_is_left_to_the_reference(asked_kernels):
+    matches = batch()
+    assert known_fraction(matches) == "matching.kernels.windows.known_fraction"
+    assert (known_fraction(replace(matches, deviation=None)) == 1).all() and len(asked_kernels) == 1

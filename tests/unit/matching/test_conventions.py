@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from geodiff_plugin.cameras import PosedViews
 from geodiff_plugin.matching import (
     build_cost_volume,
     clean,
     inverse_pose_preferred,
+    known_fraction,
     known_shape,
-    known_share,
     match_volume,
     points_to_matches,
     reject_reflections,
@@ -19,12 +20,13 @@ from geodiff_plugin.matching import (
     with_points,
 )
 from geodiff_plugin.matching.alignment import align_view, even_shifts
-from geodiff_plugin.matching.build import pilot_volume
+from geodiff_plugin.matching.build import coarse_volume
 from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.rows import hidden_strips, match_rows, row_pictures, with_hidden
+from geodiff_plugin.matching.rows import half_occlusions, row_images, with_occluded
 from geodiff_plugin.matching.winner import winner
-from geodiff_plugin.types import CameraView, PosedViews
+from tests.tiny import rows_of
 from tests.unit.matching import references as ref
+from tests.views import posed_of
 
 SIZE = (30, 48)
 K = ref.matrix(40.0, 36.0, 22.0, 16.0)
@@ -35,8 +37,7 @@ def pair(*angles: float) -> PosedViews:
     image = np.random.default_rng(0).random((3, SIZE[0], SIZE[1] + 4))
     left, right = (torch.from_numpy(x).float() for x in (image[..., :-4], image[..., 4:]))
     T = ref.right_from_left(angles or (0.0, 0.0, 0.0), (0.2, 0.0, 0.0))
-    cameras = (torch.from_numpy(x).float() for x in (K, T))
-    return PosedViews(left, (CameraView(right, *cameras),), torch.from_numpy(K).float())
+    return posed_of(left, K, (right, K, T))
 
 
 def on_cpu(*values) -> torch.Tensor:
@@ -59,14 +60,16 @@ def every_result() -> dict[str, torch.Tensor]:
     volume = build_cost_volume(posed)
     found = match_volume(volume)
     depth_m, surface, _ = maps(2)
-    points, _ = points_to_matches(on_cpu([0.1, 0.0, 2.0], [-0.3, 0.2, 1.5]), posed.K_left, SIZE, SIZE)
+    points, _ = points_to_matches(on_cpu([0.1, 0.0, 2.0], [-0.3, 0.2, 1.5]), posed.left.camera, SIZE)
     given = Matches.stack([points])
     straight = pair()
-    rows = match_rows(row_pictures(straight.left_01, straight.views[0], straight.K_left), 12.0)
-    strips = hidden_strips(rows, (15, 24), 40.0)
+    rows = rows_of(row_images(straight.left, straight.rights[0]), 12.0)
+    strips = half_occlusions(rows, (15, 24), 40.0)
     small = Matches(*(x[..., ::2, ::2] for x in maps()[:2]), on_cpu(0.1), maps()[2][..., ::2, ::2])
-    hidden = with_hidden(small, strips)
-    noisy = straight.left_01 + 0.1 * torch.from_numpy(np.random.default_rng(3).normal(size=SIZE)).float()
+    hidden = with_occluded(small, strips)
+    noisy = (
+        straight.left.image_01 + 0.1 * torch.from_numpy(np.random.default_rng(3).normal(size=SIZE)).float()
+    )
     return {
         "planes": volume.inverse_depth,
         "levels": volume.levels,
@@ -80,7 +83,7 @@ def every_result() -> dict[str, torch.Tensor]:
         "with points": with_points(batch(), given).deviation,
         "within": batch().within(surface[0] > 0.5).confidence,
         "above": batch().above(0.5),
-        "known": known_share(batch()),
+        "known": known_fraction(batch()),
         "known shape": known_shape(batch(), surface),
         "remains": reject_reflections(batch(), 1 + depth_m),
         "shift": rows.shift,
@@ -112,20 +115,19 @@ def test_results_do_not_depend_on_the_default_device_and_type_of_torch():
 
 def test_nothing_takes_gradients():
     posed = pair(0.0, 2.0, 1.0)
-    watched = posed._replace(left_01=posed.left_01.requires_grad_())
+    watched = posed._replace(left=posed.left._replace(image_01=posed.left.image_01.requires_grad_()))
     inverse, confidence, deviation = (x.requires_grad_() for x in maps())
     given = Matches(inverse, confidence, on_cpu(0.02), deviation + 1)
-    noisy = (posed.left_01 + torch.from_numpy(np.random.default_rng(3).normal(0, 0.1, SIZE)).float()).clamp(
-        0, 1
-    )
-    turned = pair(0.0, 2.0, 1.0).views[0]
+    noise = torch.from_numpy(np.random.default_rng(3).normal(0, 0.1, SIZE)).float()
+    noisy = (posed.left.image_01 + noise).clamp(0, 1)
+    turned = pair(0.0, 2.0, 1.0).rights[0]
     turned = turned._replace(image_01=turned.image_01[:1].requires_grad_())
-    grey = posed._replace(left_01=posed.left_01[:1], views=(turned,))
+    grey = PosedViews(posed.left._replace(image_01=posed.left.image_01[:1]), (turned,))
     made = [
         sweep_planes(grey, torch.linspace(0.0, 1.0, 5)).aligned[0].grey,
         build_cost_volume(watched, depth_range=(0.5, 9.0)).left_01,
-        pilot_volume(watched).left_01,
-        known_share(given),
+        coarse_volume(watched).left_01,
+        known_fraction(given),
         known_shape(given, inverse),
         reject_reflections(given, 1 + inverse),
         clean([noisy], 500)[0],
@@ -133,29 +135,10 @@ def test_nothing_takes_gradients():
     assert noisy.requires_grad and not any(each.requires_grad for each in made)
 
 
-def test_cameras_that_take_gradients_are_read():
-    """As of an optimisation of poses: the numbers are the same."""
-    posed = pair()
-    grey = posed._replace(
-        left_01=posed.left_01[:1], views=(posed.views[0]._replace(image_01=posed.left_01[:1]),)
-    )
-    (view,) = grey.views
-    cameras = [x.clone().requires_grad_() for x in (view.K, view.T_right_from_left, grey.K_left)]
-    watched = grey._replace(views=(CameraView(view.image_01, *cameras[:2]),), K_left=cameras[2])
-    planes = on_cpu(0.1, 0.4, 0.7)
-    given, found = sweep_planes(grey, planes), sweep_planes(watched, planes)
-    assert torch.equal(given.levels, found.levels) and given.reach_m == found.reach_m
-    pictures = row_pictures(
-        posed.left_01, posed.views[0]._replace(K=cameras[0], T_right_from_left=cameras[1]), cameras[2]
-    )
-    assert pictures.shift_px(0.5) == pytest.approx(0.5 * 40 * 0.2)
-
-
 def test_records_do_not_change_and_a_changed_copy_reads_its_own_pixels():
     volume = build_cost_volume(pair(), depth_range=(0.5, 9.0))
-    view = align_view(
-        pair().views[0]._replace(image_01=pair().left_01[:1]), pair().K_left, SIZE, torch.zeros(40)
-    )
+    left, (right,) = pair()
+    view = align_view(right._replace(image_01=left.image_01[:1]), left.camera, torch.zeros(40))
     records = {
         "levels": volume,
         "grey": view,

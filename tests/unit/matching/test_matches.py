@@ -1,18 +1,16 @@
-"""Matches and known points on grids: batches whose images differ, points in every form, reflections."""
+"""Matches and known points on grids: batches whose images differ, and points in every form."""
 
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import uniform_filter
-from scipy.stats import norm
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.matching import matches as module
 from geodiff_plugin.matching.matches import (
     Matches,
     points_to_matches,
     read_above,
-    reject_reflections,
     with_points,
 )
 from tests.unit.matching import references as ref
@@ -98,7 +96,7 @@ def test_points_and_maps_give_the_nearest_depth_of_every_cell(weighted):
     u, v, _ = (K @ points.T) / points[:, 2]
     given = np.column_stack([points, weight]) if weighted else points
     found, left_out = points_to_matches(
-        torch.from_numpy(given).float(), torch.from_numpy(K).float(), IMAGE, GRID
+        torch.from_numpy(given).float(), Camera(K, IMAGE[::-1]).single(), GRID
     )
     inverse, confidence, outside = expected_on_grid(zip(u, v, strict=True), points[:, 2], weight)
     assert left_out == outside > 10
@@ -112,7 +110,7 @@ def test_points_and_maps_give_the_nearest_depth_of_every_cell(weighted):
     certain = rng.uniform(0.1, 1, IMAGE) if weighted else np.ones(IMAGE)
     given = np.stack([depth, certain], -1) if weighted else depth
     found, left_out = points_to_matches(
-        torch.from_numpy(given).float(), torch.from_numpy(K).float(), IMAGE, GRID
+        torch.from_numpy(given).float(), Camera(K, IMAGE[::-1]).single(), GRID
     )
     rows, columns = np.nonzero(depth)
     pixels = zip(columns, rows, strict=True)
@@ -132,16 +130,16 @@ def test_a_pixel_reaches_half_a_pixel_beyond_its_centre():
     for n, point in enumerate(points):
         if n % 2:
             with pytest.raises(InputError, match="1 of 1 behind it or outside"):
-                points_to_matches(point[None], torch.from_numpy(straight).float(), IMAGE, GRID)
+                points_to_matches(point[None], Camera(straight, IMAGE[::-1]), GRID)
         else:
-            found, left_out = points_to_matches(point[None], torch.from_numpy(straight).float(), IMAGE, GRID)
+            found, left_out = points_to_matches(point[None], Camera(straight, IMAGE[::-1]), GRID)
             assert left_out == 0 and int((found.confidence > 0).sum()) == 1
 
 
 @pytest.mark.parametrize("shape", [(33, 20), (20, 34), (21, 33), (33, 20, 2)])
-def test_a_map_of_another_size_is_refused_with_both_sizes(shape):
+def test_a_map_of_another_size_is_rejected_with_both_sizes(shape):
     with pytest.raises(InputError, match=f"left image's 33x20 pixels; got {shape[1]}x{shape[0]}"):
-        points_to_matches(torch.ones(shape), torch.from_numpy(K).float(), IMAGE, GRID)
+        points_to_matches(torch.ones(shape), Camera(K, IMAGE[::-1]).single(), GRID)
 
 
 def test_points_of_a_batch_replace_less_confident_matches_and_stand_for_the_pixels_between_them():
@@ -174,65 +172,3 @@ def test_points_of_a_batch_replace_less_confident_matches_and_stand_for_the_pixe
     assert (none.confidence == 0).all()
     plain = Matches(*tensors(inverse, matched, [0.01, 0.02]))
     assert with_points(plain, points).deviation is None
-
-
-def remaining(inverse: np.ndarray, confidence: np.ndarray, depth_m: np.ndarray, every: int = 1) -> np.ndarray:
-    """One image's share of each match that is no reflection, by the definition."""
-    behind = np.clip(-np.log(np.maximum(inverse * depth_m, 1e-6)), -1.5, 1.5)
-    counted = np.where(confidence > 0.3, behind, np.nan)
-    spread = 1.5
-    if np.isfinite(counted).any():
-        ordered = np.sort(counted[np.isfinite(counted)])
-        apart = np.abs(counted - ordered[(len(ordered) - 1) // 2]).ravel()[::every]
-        spread = np.nanquantile(apart, 0.6) / norm.ppf(0.8)
-    least = max(3 * spread, 0.2)
-    radius = round(0.08 * max(depth_m.shape))
-    sums = [
-        uniform_filter(x, 2 * radius + 1, mode="constant") * (2 * radius + 1) ** 2
-        for x in (behind * confidence, confidence)
-    ]
-    region = sums[0] / np.maximum(sums[1], 1)
-    return 1 - np.clip((np.minimum(region, behind) / least - 1) / 0.6, 0, 1)
-
-
-def reflecting_batch(size=(31, 44)):
-    """Three images with reflections: of a good prior, of one that errs more, and without a certain match."""
-    rng = np.random.default_rng(6)
-    depth_m = rng.uniform(2, 6, (3, 1, *size))
-    noise = np.array([0.02, 0.12, 0.05]).reshape(3, 1, 1, 1)
-    inverse = np.exp(rng.normal(0.1, noise, depth_m.shape)) / depth_m
-    inverse[0, 0, 5:20, 8:25] /= 1.45
-    inverse[1, 0, 12:28, 20:38] /= 2.8
-    inverse[:, :, 28:, :3] = 0.0
-    confidence = rng.random(depth_m.shape) * (rng.random(depth_m.shape) < 0.8)
-    confidence[2] *= 0.29
-    inverse[2, 0, 5:25, 5:30] /= 2.0
-    # One match alone: its region does not support it.
-    confidence[0, 0, :14, 28:], confidence[0, 0, 5, 36] = 0.0, 0.7
-    inverse[0, 0, 5, 36] /= 2.0
-    return inverse, confidence, depth_m
-
-
-@pytest.mark.parametrize("every", [1, 4])
-def test_what_remains_of_the_reflections_of_each_image_follows_from_its_own_spread(monkeypatch, every):
-    inverse, confidence, depth_m = reflecting_batch()
-    if every > 1:  # more distances than are sorted: every fourth one is
-        monkeypatch.setattr(module, "MOST_SORTED", depth_m.size // 3)
-    given = [torch.from_numpy(x).float() for x in (inverse, confidence, depth_m)]
-    found = reject_reflections(Matches(given[0], given[1], torch.full((3,), 0.01)), given[2])
-    assert found.is_contiguous()
-    for b in range(3):
-        expected = remaining(inverse[b, 0], confidence[b, 0], depth_m[b, 0], every)
-        np.testing.assert_allclose(found[b, 0], expected, atol=2e-4)
-    assert (found[0, 0, 8:17, 12:20] < 0.5).any() and (found[1] < 0.5).any()
-    assert (found[2] == 1).all()
-    partly = (found > 0) & (found < 1)
-    assert partly[0].any() and partly[1].any()
-
-
-def test_what_lies_before_the_prior_is_never_a_reflection():
-    inverse, confidence, depth_m = reflecting_batch()
-    near = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-9) / depth_m**2, 0.4)
-    given = [torch.from_numpy(x).float() for x in (near, confidence, depth_m)]
-    found = reject_reflections(Matches(given[0], given[1], torch.full((3,), 0.01)), given[2])
-    assert (found[:2] == 1).float().mean() > 0.95

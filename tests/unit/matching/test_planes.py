@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.cameras import Camera, PosedViews, View
 from geodiff_plugin.matching.planes import Parallax, even_planes, parallax_of
-from geodiff_plugin.types import PosedViews
 from tests.unit.matching import references as ref
+from tests.views import view_of
 
 #: More pixels than are sampled, on a grid whose width shares factors with the steps of the samples.
 SIZE = (60, 96)
@@ -22,7 +23,8 @@ POSES = {
 
 
 def parallax(T: np.ndarray, K_right: np.ndarray = K_RIGHT, size=SIZE) -> Parallax:
-    return Parallax(*(torch.from_numpy(x) for x in (K, K_right, T)), size, "E")
+    image = torch.zeros(1, 1, 1)  # of which only the camera counts
+    return Parallax(Camera(K, size[::-1]), View(image, Camera(K_right), T), "E")
 
 
 def shifts(T: np.ndarray, inverse_depth: float) -> np.ndarray:
@@ -110,13 +112,13 @@ def test_a_baseline_counts_from_a_third_of_a_pixel_on():
 def test_every_view_has_the_parallax_of_its_own_camera():
     images = [np.zeros((40, 50)), np.zeros((70, 44)), np.zeros((30, 30))]
     cameras = [(K_RIGHT, POSES["turned"]), (K, POSES["beside"]), (K_RIGHT, POSES["behind"])]
-    views = tuple(ref.view_of(image, *camera) for image, camera in zip(images, cameras, strict=True))
-    posed = PosedViews(torch.zeros(1, *SIZE), views, torch.from_numpy(K).float())
+    views = tuple(ref.grey_view(image, *camera) for image, camera in zip(images, cameras, strict=True))
+    posed = PosedViews(view_of(torch.zeros(1, *SIZE), K), views)
     found = parallax_of(posed)
     for view, (K_right, T) in zip(found, cameras, strict=True):
         assert view.median_shift(0.6) == pytest.approx(parallax(T, K_right).median_shift(0.6), rel=1e-5)
     assert [view._name for view in found] == [f"E of right view {v}" for v in (1, 2, 3)]
-    assert [view._name for view in parallax_of(posed._replace(views=views[1:2]))] == ["E"]
+    assert [view._name for view in parallax_of(posed._replace(rights=views[1:2]))] == ["E"]
 
 
 @pytest.mark.parametrize("names", [("beside",), ("turned", "beside"), ("beside", "turned")])

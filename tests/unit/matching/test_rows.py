@@ -1,6 +1,5 @@
 """Matches along rows: on either side, on grids of other sizes, in metres, and what the search may find."""
 
-import math
 from dataclasses import replace
 
 import cv2
@@ -8,25 +7,24 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin._threads import BackgroundTask
+from geodiff_plugin.cameras import PosedViews, View
 from geodiff_plugin.matching import rows
-from geodiff_plugin.matching.consistency import known_share
+from geodiff_plugin.matching.consistency import known_fraction
 from geodiff_plugin.matching.gaps import find_gaps
-from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.occlusion import occlusion_order
+from geodiff_plugin.matching.matches import HalfOcclusions, Matches
 from geodiff_plugin.matching.rows import (
-    HiddenStrips,
-    RowChecks,
     RowMatches,
-    hidden_strips,
+    half_occlusions,
     match_rows,
-    rectified_pictures,
-    row_pictures,
-    with_hidden,
+    rectified_images,
+    row_images,
+    row_matches,
+    with_occluded,
 )
-from geodiff_plugin.matching.uprights import certain_shear, upright_lines
-from geodiff_plugin.types import CameraView, PosedViews
+from geodiff_plugin.trust.occlusion_order import occlusion_order
+from tests.tiny import rows_of
 from tests.unit.matching import references as ref
+from tests.views import view_of
 
 SIZE = (100, 220)
 FOCAL, BASELINE_M = 160.0, 0.25
@@ -41,8 +39,8 @@ def shift_map() -> np.ndarray:
     return shift
 
 
-def scene(side: int, infinity_px: int) -> tuple[torch.Tensor, CameraView, torch.Tensor]:
-    """The pair as a left image, a view to its right (``side`` 1) or left, and ``K_left``.
+def scene(side: int, infinity_px: int) -> tuple[View, View]:
+    """A left view, and one to its right (``side`` 1) or left.
 
     At infinity a point is ``infinity_px`` further left in the view.
     """
@@ -66,60 +64,51 @@ def scene(side: int, infinity_px: int) -> tuple[torch.Tensor, CameraView, torch.
     K_right = K_left - infinity_px * np.eye(3)[0][:, None] * np.eye(3)[2]
     T = ref.right_from_left((0.0, 0.0, 0.0), (side * BASELINE_M, 0.0, 0.0))
     left, right = (torch.from_numpy(image).float() for image in (seen(0), seen(side)))
-    cameras = (torch.from_numpy(x).float() for x in (K_right, T))
-    return left, CameraView(right, *cameras), torch.from_numpy(K_left).float()
+    return view_of(left, K_left), view_of(right, K_right, T)
 
 
 @pytest.mark.parametrize(("side", "infinity_px"), [(1, 0), (1, -6), (-1, 7)])
 def test_shifts_from_infinity_and_metres_are_right_on_either_side(side, infinity_px):
-    left, view, K = scene(side, infinity_px)
-    pictures = row_pictures(left, view, K)
-    greys = pictures.greys()
-    for grey, image in zip(greys, (left, view.image_01), strict=True):
+    left, view = scene(side, infinity_px)
+    images = row_images(left, view)
+    assert images.levels.dtype == torch.uint8 and images.device == left.image_01.device
+    greys = images.greys(images.levels)
+    for grey, image in zip(greys, (left.image_01, view.image_01), strict=True):
         luma = 255 * np.tensordot([0.299, 0.587, 0.114], image, 1)
         assert grey.dtype == np.uint8 and grey.flags.c_contiguous
         np.testing.assert_allclose(grey[:, ::side], luma, atol=0.501)
-    assert pictures.infinity_px == side * infinity_px and pictures.focal_px == FOCAL
-    assert (pictures.shift_m > 0) == (side < 0)
-    assert pictures.shift_px(0.5) == pytest.approx(0.5 * FOCAL * BASELINE_M)
+    assert images.infinity_px == side * infinity_px and images.focal_px == FOCAL
+    assert images.mirrored is (side < 0) and (images.shift_m > 0) == (side < 0)
+    assert images.shift_px(0.5) == pytest.approx(0.5 * FOCAL * BASELINE_M)
 
-    found, expected = match_rows(pictures, 19.0), shift_map()
+    shifts, expected = match_rows(images, greys, 19.0), shift_map()
+    found = row_matches(images, shifts)
     assert found.baseline_m.shape == () and float(found.baseline_m) == pytest.approx(BASELINE_M)
-    matched, hidden, filled = (x.numpy() for x in (found.matched, found.hidden, found.filled))
-    assert set(np.unique([matched, hidden, filled])) <= {0.0, 1.0}
-    assert matched.mean() > 0.7 and (matched + hidden + filled).max() == 1
-    np.testing.assert_array_equal(found.certain, matched + hidden)
+    matched, occluded, filled = (x.numpy() for x in (found.matched, found.occluded, found.filled))
+    assert set(np.unique([matched, occluded, filled])) <= {0.0, 1.0}
+    assert matched.mean() > 0.7 and (matched + occluded + filled).max() == 1
+    np.testing.assert_array_equal(found.certain, matched + occluded)
     shift = found.shift.numpy()
     off = np.abs(shift - expected)[matched > 0]
     assert np.median(off) < 0.2 and (off > 1).mean() < 0.05
-    # A strip as wide as the step beside each box is hidden: on its left from a view on the right.
+    # A strip as wide as the step next to each box is hidden: on its left from a view on the right.
     for (top, bottom, first, end), box in BOXES.items():
         strip = np.arange(first - box + WALL, first) if side > 0 else np.arange(end, end + box - WALL)
         inner = np.ix_(np.arange(top + 8, bottom - 8), strip[3:-3])
-        assert hidden[inner].mean() > 0.6 and matched[inner].mean() < 0.35
+        assert occluded[inner].mean() > 0.6 and matched[inner].mean() < 0.35
         assert np.median(np.abs(shift[inner] - WALL)) < 0.3  # of the wall, which goes on behind
         other = np.arange(end + 2, end + 6) if side > 0 else np.arange(first - 6, first - 2)
-        assert hidden[np.ix_(np.arange(top + 8, bottom - 8), other)].mean() < 0.1
+        assert occluded[np.ix_(np.arange(top + 8, bottom - 8), other)].mean() < 0.1
     gaps = find_gaps(matched[:, ::side] > 0)
     unknown = gaps.put(np.zeros(SIZE, bool), gaps.inner)[:, ::side]
-    np.testing.assert_array_equal(unknown, (hidden + filled) > 0)
-    checks = found.checks.result()
-    flipped = np.ascontiguousarray(shift[:, ::side]), matched[:, ::side]
-    assert checks.occlusion == occlusion_order(greys[0], flipped[0], gaps) > 0.3
-    shear = certain_shear(upright_lines(greys[0]), *flipped)
-    assert checks.shear == shear or (math.isnan(shear) and math.isnan(checks.shear))
-
-
-def test_the_checks_of_a_pair_are_its_shear_and_its_occlusions_in_this_order(monkeypatch):
-    monkeypatch.setattr(
-        rows, "certain_shear", lambda lines, shift, known: (len(lines), shift.shape, known.mean())
-    )
-    monkeypatch.setattr(rows, "occlusion_order", lambda grey, shift, gaps: (grey.dtype, shift.shape, gaps))
-    found = match_rows(row_pictures(*scene(1, 0)), 19.0)
-    shear, (dtype, shape, gaps) = found.checks.result()
-    assert shear == (shear[0], SIZE, pytest.approx(float(found.matched.mean()), abs=1e-6))
-    assert dtype == np.uint8 and shape == SIZE
-    np.testing.assert_array_equal(gaps.unknown, found.matched == 0)
+    np.testing.assert_array_equal(unknown, (occluded + filled) > 0)
+    # The checks of the rows see the pair as if its second view were on the right.
+    assert shifts.grey is greys[0] and shifts.known.dtype == bool
+    np.testing.assert_array_equal(shifts.known, matched[:, ::side] > 0)
+    np.testing.assert_array_equal(shifts.gaps.unknown, gaps.unknown)
+    at = shifts.known
+    np.testing.assert_array_equal(shifts.shift[at], shift[:, ::side][at])
+    assert occlusion_order(shifts.grey, shifts.shift, shifts.gaps) > 0.3
 
 
 @pytest.mark.parametrize(
@@ -165,7 +154,7 @@ def test_shifts_below_a_third_of_a_pixel_are_not_known():
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_the_matcher_has_the_penalties_that_opencv_recommends(channels):
-    """8 and 32 times the channels and the area of the block, as its documentation says."""
+    """8 and 32 times the channels and the area of the block, as in its documentation."""
     matcher = rows.make_matcher(-5, 48, channels)
     assert (matcher.getMinDisparity(), matcher.getNumDisparities()) == (-5, 48)
     size = matcher.getBlockSize()
@@ -181,65 +170,65 @@ def test_columns_are_padded_on_the_left_by_the_first_one():
     np.testing.assert_array_equal(rows.pad_columns(image, 3), np.pad(image, ((0, 0), (3, 0)), mode="edge"))
 
 
-def test_large_pictures_are_matched_on_a_smaller_grid_with_its_cameras(monkeypatch):
+def test_large_images_are_matched_on_a_smaller_grid_with_its_cameras(monkeypatch):
     """Of 100 x 220 pixels a quarter: shifts, focal length and infinity are half as many pixels."""
     assert rows.grid_of_rows((600, 1000)) == (600, 1000)
     assert rows.grid_of_rows((1200, 2000)) == (600, 1000)
     assert rows.grid_of_rows((832, 1248)) == (632, 949)
-    left, view, K = scene(1, -6)
-    monkeypatch.setattr(rows, "MOST_PIXELS", 50 * 110)
-    pictures = rectified_pictures(PosedViews(left, (view,), K))
-    assert pictures.greys()[0].shape == (50, 110)
-    assert pictures.focal_px == pytest.approx(FOCAL / 2) and pictures.infinity_px == pytest.approx(-3.0)
-    found = match_rows(pictures, 9.0)
+    left, view = scene(1, -6)
+    monkeypatch.setattr(rows, "MAX_PIXELS", 50 * 110)
+    images = rectified_images(PosedViews(left, (view,)))
+    assert images.levels.shape == (2, 50, 110)
+    assert images.focal_px == pytest.approx(FOCAL / 2) and images.infinity_px == pytest.approx(-3.0)
+    found = rows_of(images, 9.0)
     expected = shift_map()[::2, ::2] / 2
     assert np.median(np.abs(found.shift.numpy() - expected)[found.matched.numpy() > 0]) < 0.4
     depth_m = FOCAL * BASELINE_M / 17  # of the first box
-    assert pictures.shift_px(1 / depth_m) == pytest.approx(17 / 2)
+    assert images.shift_px(1 / depth_m) == pytest.approx(17 / 2)
 
 
 def test_the_first_view_that_is_rectified_and_of_the_left_image_size_is_matched():
-    left, view, K = scene(1, -6)
-    turned = view._replace(
-        T_right_from_left=torch.from_numpy(ref.right_from_left((0.0, 3.0, 0.0), (0.3, 0.0, 0.0))).float()
-    )
+    left, view = scene(1, -6)
+    turned = view._replace(T_right_from_left=ref.right_from_left((0.0, 3.0, 0.0), (0.3, 0.0, 0.0)))
     smaller = view._replace(image_01=view.image_01[:, :, 1:])
-    farther = view._replace(T_right_from_left=view.T_right_from_left * torch.tensor([1.0, 1, 1, 3]))
-    pictures = rectified_pictures(PosedViews(left, (turned, smaller, view, farther), K))
-    assert abs(float(pictures.shift_m)) == pytest.approx(BASELINE_M) and pictures.infinity_px == -6
-    other = rectified_pictures(PosedViews(left, (smaller, farther, view), K))
+    farther = view._replace(T_right_from_left=view.T_right_from_left * np.array([1.0, 1, 1, 3]))
+    images = rectified_images(PosedViews(left, (turned, smaller, view, farther)))
+    assert abs(float(images.shift_m)) == pytest.approx(BASELINE_M) and images.infinity_px == -6
+    other = rectified_images(PosedViews(left, (smaller, farther, view)))
     assert abs(float(other.shift_m)) == pytest.approx(3 * BASELINE_M)
     for views in ((), (turned,), (smaller,), (turned, smaller)):
-        assert rectified_pictures(PosedViews(left, views, K)) is None
+        assert rectified_images(PosedViews(left, views)) is None
 
 
 def test_a_pair_of_which_nothing_matches_has_no_shift():
     blank = torch.full((3, 40, 80), 0.5)
-    K = torch.from_numpy(ref.matrix(FOCAL, 150.0, 40.0, 20.0)).float()
-    found = match_rows(row_pictures(blank, CameraView(blank, *scene(1, 0)[1][1:])._replace(K=K), K), 10.0)
-    for each in (found.shift, found.matched, found.hidden, found.filled):
+    left = view_of(blank, ref.matrix(FOCAL, 150.0, 40.0, 20.0))
+    right = left._replace(T_right_from_left=scene(1, 0)[1].T_right_from_left)
+    images = row_images(left, right)
+    shifts = match_rows(images, images.greys(images.levels), 10.0)
+    assert not shifts.known.any()
+    found = row_matches(images, shifts)
+    for each in (found.shift, found.matched, found.occluded, found.filled):
         assert each.shape == (40, 80) and not each.any()
-    assert all(math.isnan(check) for check in found.checks.result())
 
 
-def row_matches(size=(12, 30)) -> RowMatches:
+def made_rows(size=(12, 30)) -> RowMatches:
     rng = np.random.default_rng(3)
     shift = rng.uniform(0, 20, size) * (rng.random(size) < 0.9)
     kind = rng.integers(0, 4, size)
     maps = [shift, *(kind == k for k in (1, 2, 3))]
-    checks = BackgroundTask.known(RowChecks(math.nan, math.nan))
-    return RowMatches(*(torch.from_numpy(np.asarray(x, np.float32)) for x in maps), torch.tensor(0.2), checks)
+    return RowMatches(*(torch.from_numpy(np.asarray(x, np.float32)) for x in maps), torch.tensor(0.2))
 
 
 @pytest.mark.parametrize("size", [(12, 30), (4, 6), (36, 90)])
 def test_hidden_strips_on_another_grid_have_the_inverse_depth_of_the_farther_surface(size):
-    found, made = row_matches(), hidden_strips(row_matches(), size, 150.0)
+    found, made = made_rows(), half_occlusions(made_rows(), size, 150.0)
     at = np.ix_(
         *(np.floor((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(size, (12, 30), strict=True))
     )
-    shift, hidden = found.shift.numpy()[at], found.hidden.numpy()[at]
+    shift, occluded = found.shift.numpy()[at], found.occluded.numpy()[at]
     assert made.inside.shape == made.inverse_depth.shape == (1, 1, *size)
-    np.testing.assert_array_equal(made.inside[0, 0], (hidden > 0) & (shift > 0))
+    np.testing.assert_array_equal(made.inside[0, 0], (occluded > 0) & (shift > 0))
     np.testing.assert_allclose(made.inverse_depth[0, 0], shift / (150.0 * 0.2), rtol=1e-6)
 
 
@@ -250,13 +239,13 @@ def test_strips_count_as_much_as_the_matches_around_them_where_these_are_not_kep
     confidence = np.where(rng.random(shape) < 0.5, 0.0, rng.choice([0.04, 0.06, 0.9], shape))
     parts = [rng.random(shape), confidence, np.array([0.02]), rng.uniform(1, 6, shape)]
     matches = Matches(*(torch.from_numpy(x).float() for x in parts[: 3 + deviates]))
-    strips = HiddenStrips(
+    strips = HalfOcclusions(
         torch.from_numpy(rng.random(shape) < 0.4), torch.from_numpy(rng.random(shape)).float()
     )
-    found = with_hidden(matches, strips)
+    found = with_occluded(matches, strips)
     put = strips.inside.numpy() & (confidence < 0.05)
     assert put.any() and (strips.inside.numpy() & ~put).any()
-    known = known_share(matches).numpy()
+    known = known_fraction(matches).numpy()
     assert (known == 1).all() if not deviates else (known < 1).any()
     np.testing.assert_allclose(
         found.confidence, np.where(put, 0.8 * known, np.float32(confidence)), rtol=1e-6
@@ -267,3 +256,12 @@ def test_strips_count_as_much_as_the_matches_around_them_where_these_are_not_kep
         np.testing.assert_array_equal(found.deviation, np.where(put, 1, np.float32(parts[3])))
     assert replace(found, inverse_depth=matches.inverse_depth).plane_step is matches.plane_step
     assert deviates or found.deviation is None
+
+
+def test_strips_among_matches_without_deviations_are_left_to_the_reference(asked_kernels):
+    confidence = torch.full((1, 1, 3, 4), 0.5)
+    strips = HalfOcclusions(confidence > 1, confidence)
+    matches = Matches(confidence, confidence, torch.tensor(0.1), confidence)
+    assert with_occluded(matches, strips) == "matching.kernels.windows.with_occluded"
+    matches = replace(matches, deviation=None)
+    assert torch.equal(with_occluded(matches, strips).confidence, confidence) and len(asked_kernels) == 1

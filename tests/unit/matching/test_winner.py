@@ -3,7 +3,8 @@
 import numpy as np
 import torch
 
-from geodiff_plugin.matching.winner import NEVER, winner, winner_positions
+from geodiff_plugin.matching.constants import NEVER
+from geodiff_plugin.matching.winner import winner, winner_positions
 from tests.unit.matching import references as ref
 
 
@@ -19,10 +20,10 @@ def test_positions_alone_are_those_of_the_winner_with_its_evidence():
         assert torch.equal(found.position, alone)
         np.testing.assert_array_equal(found.best, sums.min(0))
         if planes < 3:
-            assert (found.runner_up == NEVER).all()
+            assert (found.second_best == NEVER).all()
         elif planes == 3:  # only at the ends is there a plane that is no neighbour
             middle = sums.argmin(0) == 1
-            np.testing.assert_array_equal(found.runner_up == NEVER, middle)
+            np.testing.assert_array_equal(found.second_best == NEVER, middle)
 
 
 def test_where_no_view_sees_a_pixel_nothing_is_gained():

@@ -3,9 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin.pose.tracks import Tracks
+from geodiff_plugin.cameras import PosedViews
+from geodiff_plugin.pose.fit import PosedGreys, PoseFit
+from geodiff_plugin.pose.tracks import Tracks, median_residuals
+from tests.views import grey_of, posed_of
 
 #: ``(height, width)`` of the left and of the right images.
 SIZES = ((500, 640), (600, 560), (420, 700))
@@ -89,3 +93,16 @@ def off_lines(left_px: np.ndarray, right_px: np.ndarray, K_left, K_right, T) -> 
     along = (second - first) / np.linalg.norm(second - first, axis=1, keepdims=True)
     off = right_px - first
     return np.abs(off[:, 0] * along[:, 1] - off[:, 1] * along[:, 0])
+
+
+def posed_fit(
+    tracks: Tracks, given: np.ndarray, images: list[torch.Tensor] | None = None
+) -> tuple[PosedViews, PoseFit]:
+    """The views of a scene with these poses, and how their matches fit; the images are smaller than it."""
+    images = images or [torch.zeros(3, 30, 28), torch.zeros(3, 21, 35)]
+    Ks = [tracks.K_left, *tracks.K_rights]
+    greys = [grey_of(np.zeros(size, np.uint8), K) for size, K in zip(SIZES, Ks, strict=False)]
+    rights = zip(images, tracks.K_rights, given, strict=False)
+    posed = posed_of(torch.zeros(3, 25, 32), K_LEFT, *rights)
+    fit = PoseFit(PosedGreys(greys, given, [500, 600, 420]), tracks, median_residuals(tracks, given))
+    return posed, fit

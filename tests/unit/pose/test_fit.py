@@ -2,16 +2,16 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.pose import fit as fit_module
-from geodiff_plugin.pose.fit import PosedGreys, PoseFit, fit_of_small, measure_fit, posed_greys
+from geodiff_plugin.pose.fit import PosedGreys, PoseFit, fit_of_small, measure_fit, pose_change, posed_greys
 from geodiff_plugin.pose.tracks import Tracks
-from geodiff_plugin.types import CameraView, PosedViews, Tear
-from tests.unit.pose.posed_scene import POSES, camera, pose, projected
+from tests.unit.pose.posed_scene import POSES, camera, moved, pose, projected
+from tests.views import grey_of, posed_of
 
 K = camera(300.0, 300.0, 159.5, 119.5)
 RIG = np.linalg.inv(np.stack([pose((0, 0, 0), (0.3, 0, 0)), pose((0, 0, 0), (-0.2, 0, 0))]))
@@ -19,7 +19,7 @@ POSED = np.linalg.inv(POSES)
 
 
 def greys_of(Ts: np.ndarray) -> PosedGreys:
-    return PosedGreys([(np.zeros((240, 320), np.uint8), K)] * (len(Ts) + 1), Ts, [240] * (len(Ts) + 1))
+    return PosedGreys([grey_of(np.zeros((240, 320), np.uint8), K)] * (len(Ts) + 1), Ts, [240] * (len(Ts) + 1))
 
 
 def tracks_off_by(Ts: np.ndarray, off_px, count: int = 60) -> Tracks:
@@ -49,17 +49,16 @@ def matching(monkeypatch, by_scale) -> list[float]:
 
 
 def test_views_keep_their_cameras_and_the_heights_of_their_images():
-    left = torch.rand(3, 480, 1000)
-    Ts = torch.from_numpy(POSED).float()
+    left = torch.rand(3, 480, 1000), camera(800.0, 820.0, 510.0, 230.0)
     rights = (
-        CameraView(torch.rand(3, 300, 500), torch.tensor(camera(900.0, 910.0, 240.0, 150.0)), Ts[0]),
-        CameraView(torch.rand(1, 700, 400), torch.tensor(camera(400.0, 420.0, 210.0, 340.0)), Ts[1]),
+        (torch.rand(3, 300, 500), camera(900.0, 910.0, 240.0, 150.0), POSED[0]),
+        (torch.rand(1, 700, 400), camera(400.0, 420.0, 210.0, 340.0), POSED[1]),
     )
-    made = posed_greys(PosedViews(left, rights, torch.tensor(camera(800.0, 820.0, 510.0, 230.0))))
+    made = posed_greys(posed_of(*left, *rights))
     assert list(made.heights) == [480, 300, 700]
     assert made.given.dtype == np.float64
     np.testing.assert_allclose(made.given, POSED, atol=1e-6)
-    assert [grey.shape for grey, _ in made.views] == [(399, 832), (222, 370), (700, 400)]
+    assert [view.grey.shape for view in made.views] == [(399, 832), (222, 370), (700, 400)]
     assert not made.rig
 
 
@@ -73,19 +72,17 @@ def test_a_rig_is_one_if_all_of_its_poses_are_rectified(Ts, is_rig):
     assert fit.rig is is_rig and fit.limit_px == (0.45 if is_rig else 0.3)
 
 
-def test_signs_of_images_are_those_of_all_views_in_pixels_of_the_originals():
-    rng = np.random.default_rng(0)
-    images = [rng.integers(60, 200, (240, 320)).astype(np.uint8) for _ in range(3)]
-    smooth = []
-    for _ in range(3):
-        details = (cv2.GaussianBlur(rng.normal(0, 60 * size, (240, 320)), (0, 0), size) for size in (2, 6))
-        smooth.append(np.clip(128 + sum(details) + rng.normal(0, 1, (240, 320)), 0, 255).astype(np.uint8))
-    smooth[2][90:] = np.roll(smooth[2][90:], 12, axis=1)
-    greys = PosedGreys([(image, K) for image in smooth], RIG, [240, 240, 720])
-    assert greys.signs.tear == Tear(2, 270, 36) and greys.signs.bars == 0.0
-    for image in images:
-        image[:24], image[-24:] = 0, 0
-    assert PosedGreys([(image, K) for image in images], RIG, [240] * 3).signs == (None, 0.1)
+def test_a_change_of_pose_is_its_angle_and_its_shift_in_baselines():
+    steps = np.array([[0.02, -0.01, 0.03, 0.0, 0.0, 0.0], [0.0, 0.3, -0.1, 0.05, -0.08, 0.02]])
+    changed = np.stack([moved(T, step) for T, step in zip(POSED, steps, strict=True)])
+    turned_deg, shifts = pose_change(POSED, changed)
+    np.testing.assert_allclose(turned_deg, np.degrees(np.linalg.norm(steps[:, :3], axis=1)))
+    for T, step, shift in zip(POSED, steps, shifts, strict=True):
+        # In the frame of the given right camera: the place that the change moves its centre to.
+        R = Rotation.from_rotvec(step[:3]).as_matrix()
+        place = R @ T[:3, 3] + step[3:] - R @ T[:3, :3] @ T[:3, :3].T @ T[:3, 3]
+        assert shift == pytest.approx(np.linalg.norm(place) / np.linalg.norm(T[:3, 3]))
+    np.testing.assert_allclose(pose_change(POSED, POSED), np.zeros((2, 2)), atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -109,19 +106,19 @@ def test_poses_fit_if_enough_matches_show_no_view_that_misses(counts, residual_p
 
 @pytest.mark.parametrize(("Ts", "limit_px"), [(RIG, 0.45), (POSED, 0.3)], ids=["rig", "posed"])
 def test_small_images_show_that_poses_fit_only_well_below_the_limit_in_all_views(Ts, limit_px, monkeypatch):
-    for share, surely in (
+    for fraction, surely in (
         ((0.84, 0.3), True),
         ((0.86, 0.3), False),
         ((0.3, 0.86), False),
         ((0.3, np.nan), False),
     ):
-        off_px = limit_px * np.array(share)
+        off_px = limit_px * np.array(fraction)
         scales = matching(monkeypatch, {"Ts": Ts, 0.5: off_px})
         found = fit_of_small(greys_of(Ts))
         assert scales == [0.5] and found.is_small and found.surely is surely
         np.testing.assert_allclose(found.residual_px, off_px, rtol=1e-6)
         whole = matching(monkeypatch, {"Ts": Ts, 1.0: (0.11, 0.12)})
-        again = found.of_whole_pictures()
+        again = found.at_full_resolution()
         assert whole == [1.0] and not again.is_small and again.surely is surely and len(again.tracks) == 60
         np.testing.assert_allclose(again.residual_px, (0.11, 0.12), rtol=1e-6)
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.pose import multiview
 from geodiff_plugin.pose.multiview import GivenFrames, SolvedCapture, candidate_pairs, solve_capture
 from geodiff_plugin.pose.reconstruction import Match
@@ -125,12 +126,12 @@ def test_an_alignment_brings_a_turned_capture_back_even_from_a_straight_line():
     points = np.random.default_rng(0).normal(size=(7, 3))
     other = true.copy()
     other[:, :3, :3], other[:, :3, 3] = R @ true[:, :3, :3], true[:, :3, 3] @ R.T / 2.5 + t
-    found = multiview._aligned(capture(other, true, points=points @ R.T / 2.5 + t), true, 2.5)
+    found = multiview._align(capture(other, true, points=points @ R.T / 2.5 + t), true, 2.5)
     np.testing.assert_allclose(found.E, true, atol=1e-9)
     np.testing.assert_allclose(found.points, points, atol=1e-9)
     wrong = true.copy()
     wrong[2, :3, 3] += 5.0  # one wrong place moves nothing
-    found = multiview._aligned(capture(other, true, points=points @ R.T / 2.5 + t), wrong, 2.5)
+    found = multiview._align(capture(other, true, points=points @ R.T / 2.5 + t), wrong, 2.5)
     np.testing.assert_allclose(found.E, true, atol=0.05)
 
 
@@ -141,13 +142,13 @@ def test_leaving_out_stretches_of_frames_gives_the_standard_error_of_a_mean():
     def mean(kept: np.ndarray) -> float:
         return float(values[kept].mean())
 
-    found = multiview._jackknifed(mean, np.array_split(np.arange(12), 12), 0.15)
+    found = multiview._jackknife(mean, np.array_split(np.arange(12), 12), 0.15)
     assert found.value == pytest.approx(values.mean())
     assert found.spread == pytest.approx(values.std(ddof=1) / math.sqrt(12))
-    three = multiview._jackknifed(mean, np.array_split(np.arange(12), 3), 0.15)
+    three = multiview._jackknife(mean, np.array_split(np.arange(12), 3), 0.15)
     means = values.reshape(3, 4).mean(1)
     assert three.spread == pytest.approx(means.std(ddof=1) / math.sqrt(3))
-    assert multiview._jackknifed(mean, np.array_split(np.arange(2), 2), 0.15) == (
+    assert multiview._jackknife(mean, np.array_split(np.arange(2), 2), 0.15) == (
         pytest.approx(values[:2].mean()),
         0.15,
     )
@@ -170,7 +171,7 @@ def test_a_capture_gets_the_scale_on_which_trajectory_and_depths_agree(known):
         wrong = {k: float(5 * z[k]) for k in range(4)}  # points that moved; the median counts
         given_depths.append({k: float(factor * depth) for k, depth in enumerate(z)} | wrong | {900: 1.0})
         solved_depths.append({k: float(depth) for k, depth in enumerate(z)} | {901: 1.0})
-    found = multiview._scaled(capture(small, true), given_depths, solved_depths)
+    found = multiview._rescale(capture(small, true), given_depths, solved_depths)
     assert found.scale_trajectory == pytest.approx(1.6)
     assert found.scale_depth == pytest.approx(
         math.exp(np.median(np.log(np.delete(factors, 7)))) if known else 1.0
@@ -188,7 +189,7 @@ def test_a_capture_gets_the_scale_on_which_trajectory_and_depths_agree(known):
     values = np.log([found.scale_depth, 1.6])
     mean = weights @ values
     spread = math.sqrt(1 / (1 / variances).sum() + (weights @ (values - mean) ** 2))
-    assert found.scale_spread == pytest.approx(spread, rel=1e-3)
+    assert found.scale_rel_std == pytest.approx(spread, rel=1e-3)
     steps = np.linalg.norm(np.diff(found.E[:, :3, 3], axis=0), axis=1)
     true_steps = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps / true_steps, math.exp(mean) / 1.6, rtol=1e-6)
@@ -198,27 +199,28 @@ def test_a_scale_of_two_frames_is_as_uncertain_as_those_of_trackers():
     """The lengths of two frames, and the depth of their scene, are known from one pair alone."""
     E = walk(2)
     depths = [dict.fromkeys(range(25), 2.0)] * 2
-    found = multiview._scaled(capture(E, E), depths, depths)
+    found = multiview._rescale(capture(E, E), depths, depths)
     by_depth, by_length = math.hypot(0.05, 0.015), math.hypot(0.15, 0.02)
-    assert found.scale_spread == pytest.approx((by_depth**-2 + by_length**-2) ** -0.5)
+    assert found.scale_rel_std == pytest.approx((by_depth**-2 + by_length**-2) ** -0.5)
 
 
-def notes_of(result: SolvedCapture, names=None) -> dict[str, str]:
-    notes = multiview._noted(result, [], names or NAMES[: len(result.E)]).notes
-    return {note.code: str(note) for note in notes}
+def findings_of(result: SolvedCapture, names=None) -> dict[str, str]:
+    """The sentences of the findings by their codes."""
+    findings = multiview._with_findings(result, [], names or NAMES[: len(result.E)]).findings
+    return {finding.code: str(finding) for finding in findings}
 
 
 @pytest.mark.parametrize("factor", [1.10, 1 / 1.10, 1.11, 1 / 1.11])
 def test_scales_that_disagree_by_a_tenth_are_reported_whichever_is_larger(factor):
     E = walk(4)
-    found = notes_of(capture(E, E, scale_trajectory=3.0 * factor, scale_depth=3.0, scale_spread=0.1))
+    found = findings_of(capture(E, E, scale_trajectory=3.0 * factor, scale_depth=3.0, scale_rel_std=0.1))
     assert ("capture.scales" in found) is (abs(math.log(factor)) > 0.1)
     if found:
-        assert f"are {100 * abs(factor - 1):.0f} % apart" in found["capture.scales"]
+        assert f"differ by {100 * abs(factor - 1):.0f} %" in found["capture.scales"]
     assert "capture.scale" not in found
-    uncertain = notes_of(capture(E, E, scale_spread=0.114))
+    uncertain = findings_of(capture(E, E, scale_rel_std=0.114))
     assert list(uncertain) == ["capture.scale"] and "by 11 %" in uncertain["capture.scale"]
-    assert notes_of(capture(E, E)) == {}
+    assert findings_of(capture(E, E)) == {}
 
 
 @pytest.mark.parametrize(
@@ -240,27 +242,27 @@ def test_given_places_are_wrong_if_the_solve_moves_them_far_more_than_others(med
     E[:, 1, 3] += median_m
     E[[2, 4], 1, 3] = -far_m
     connected = np.arange(7) != 4  # the other moved frame keeps its pose as given
-    found = notes_of(capture(E, given, connected))
+    found = findings_of(capture(E, given, connected))
     assert ("capture.wrong-poses" in found) is is_wrong
     if is_wrong:
         assert "poses of frame 2 are far" in found["capture.wrong-poses"]
     assert "1 of 7 frames" in found["capture.unconnected"] and "frame 4." in found["capture.unconnected"]
     apart = connected & (np.arange(7) != 2)
-    assert "capture.wrong-poses" not in notes_of(capture(E, given, apart))
-    assert "capture.wrong-poses" not in notes_of(capture(E, given, connected, status="kept"))
+    assert "capture.wrong-poses" not in findings_of(capture(E, given, apart))
+    assert "capture.wrong-poses" not in findings_of(capture(E, given, connected, status="kept"))
 
 
 def test_frames_that_are_not_connected_are_listed_with_what_becomes_of_them():
     E = walk(9)
     connected = np.array([True, False, True, False, False, False, False, False, False])
-    found = notes_of(capture(E, E, connected))["capture.unconnected"]
-    assert found.startswith("7 of 9 frames") and "keep their poses as given" in found
+    found = findings_of(capture(E, E, connected))["capture.unconnected"]
+    assert found.startswith("7 of 9 frames") and "keep their given poses" in found
     assert "frame 1, frame 3, frame 4, frame 5, frame 6 and 2 more." in found
-    estimated = notes_of(capture(E, None, connected, status="estimated"))["capture.unconnected"]
+    estimated = findings_of(capture(E, None, connected, status="estimated"))["capture.unconnected"]
     assert "have no pose and are skipped" in estimated
-    assert notes_of(capture(E, E, connected, status="given")) == {}
+    assert findings_of(capture(E, E, connected, status="given")) == {}
     five = connected | (np.arange(9) > 6)
-    assert "frame 6." in notes_of(capture(E, E, five))["capture.unconnected"]
+    assert "frame 6." in findings_of(capture(E, E, five))["capture.unconnected"]
 
 
 SIZES = ((1600, 1200), (640, 480), (900, 1000))
@@ -307,11 +309,11 @@ class Synthetic:
             keypoints = np.c_[on_grid, np.full((inside.sum(), 2), 2.0)].astype(np.float32)
             self.features.append((keypoints, descriptors[inside]))
         monkeypatch.setattr(
-            "geodiff_plugin.pose.reconstruction._features", lambda image, factor: self.features[image]
+            "geodiff_plugin.pose.reconstruction._features", lambda image, size: self.features[image]
         )
 
     def solve(self, given, **how) -> SolvedCapture:
-        frames = GivenFrames(NAMES[: len(self.E)], self.K, given, self.sizes)
+        frames = GivenFrames(NAMES[: len(self.E)], list(map(Camera, self.K, self.sizes)), given)
         return solve_capture(range(len(self.E)), frames, **how)
 
     def relative_error(self, E) -> tuple[float, float]:
@@ -333,12 +335,12 @@ def test_frames_of_cameras_that_differ_are_solved_to_their_metres(monkeypatch):
     made = Synthetic(monkeypatch)
     given = drifted(made.E)
     found = made.solve(given)
-    assert found.status == "solved" and found.connected.all() and found.notes == ()
+    assert found.status == "solved" and found.connected.all() and found.findings == ()
     before, after = made.relative_error(given), made.relative_error(found.E)
     assert after[0] < 0.15 < 0.6 < before[0] and after[1] < 0.03 < before[1]
     assert found.residual_px < 0.25 * found.residual_px_given
     assert found.scale_trajectory == pytest.approx(1.0, abs=0.06)
-    assert found.scale_depth == pytest.approx(1.0, abs=0.06) and 0.01 < found.scale_spread < 0.06
+    assert found.scale_depth == pytest.approx(1.0, abs=0.06) and 0.01 < found.scale_rel_std < 0.06
     np.testing.assert_allclose(found.K, made.K, rtol=1e-6)  # too few frames for another focal length
     np.testing.assert_array_equal(found.E_given, given)
     for i, (px, rows) in enumerate(found.seen):
@@ -363,10 +365,10 @@ def test_exact_poses_are_kept_and_given_ones_are_not_adjusted(monkeypatch):
         np.testing.assert_array_equal(found.E_given, given)
         np.testing.assert_allclose(found.K, made.K, rtol=1e-6)
         assert found.residual_px == found.residual_px_given > 0
-        assert (found.scale_trajectory, found.scale_depth) == (1.0, 1.0) and math.isnan(found.scale_spread)
-        assert [note.code for note in found.notes] == (["capture.kept"] if status == "kept" else [])
+        assert (found.scale_trajectory, found.scale_depth) == (1.0, 1.0) and math.isnan(found.scale_rel_std)
+        assert [finding.code for finding in found.findings] == (["capture.kept"] if status == "kept" else [])
         if status == "kept":
-            assert f"({found.residual_px:.2f} px)" in found.notes[0]
+            assert f"fit within {found.residual_px:.2f} px and" in found.findings[0]
             for i, (px, rows) in enumerate(found.seen):
                 # Each point is where the scene has it.
                 nearest = np.linalg.norm(found.points[rows][:, None] - made.points, axis=2).min(1)
@@ -380,7 +382,7 @@ def test_frames_with_few_features_are_named_and_shared_points_are_needed(monkeyp
     made.features[2] = keypoints[:15], descriptors[:15]
     given = drifted(made.E)
     found = made.solve(given)
-    codes = {note.code: str(note) for note in found.notes}
+    codes = {finding.code: str(finding) for finding in found.findings}
     assert codes["capture.blurred"].startswith("frame 2: blurred")
     assert "1 of 5 frames" in codes["capture.unconnected"] and "frame 2." in codes["capture.unconnected"]
     np.testing.assert_array_equal(found.connected, np.arange(5) != 2)
@@ -391,11 +393,11 @@ def test_frames_with_few_features_are_named_and_shared_points_are_needed(monkeyp
             np.random.default_rng(i).integers(0, 120, made.features[i][1].shape).astype(np.uint8),
         )
     apart = made.solve(given)
-    assert [note.code for note in apart.notes] == ["capture.blurred", "capture.no-matches"]
+    assert [finding.code for finding in apart.findings] == ["capture.blurred", "capture.no-matches"]
     assert len(apart.points) == 0
     np.testing.assert_array_equal(apart.E, given)
     monkeypatch.setattr(multiview.Reconstruction, "from_nothing", lambda base: [])
-    with pytest.raises(InputError, match=r"connected by matches; got no two that are\. Take photographs"):
+    with pytest.raises(InputError, match=r"connected by matches; got no connected pair\. Take images"):
         made.solve(None)
 
 
@@ -492,7 +494,9 @@ def test_frames_without_poses_get_those_of_the_largest_model_and_parts_are_repor
     alone = multiview.residuals_px(lost, K, [good])
     assert found.status == "estimated" and found.E_given is None
     assert math.isnan(found.residual_px_given) and found.residual_px == pytest.approx(np.median(alone[0]))
-    assert [note.code for note in notes] == ["capture.parts"] and "form 2 parts" in notes[0]
+    assert [finding.code for finding in notes] == [
+        "capture.components"
+    ] and "form 2 unconnected parts" in notes[0]
     for models, count in (((fake_model(E, seen_of),) * 2, 0), ((fake_model(lost, seen_of),), 0)):
         base.models, notes = list(models), []
         multiview._from_nothing(base, notes)
@@ -571,7 +575,11 @@ def test_given_poses_stay_without_points_or_without_a_gain_and_frames_that_get_w
     base = FakeSolve(E, posed_matches(E, K, np.array([3.0, -40.0])))
     found = multiview._from_given(base, given, notes, True)
     before = multiview.median_px(multiview.residuals_px(given, K, base.matches))
-    assert found.status == "kept" and found.E is given and [note.code for note in notes] == ["capture.kept"]
+    assert (
+        found.status == "kept"
+        and found.E is given
+        and [finding.code for finding in notes] == ["capture.kept"]
+    )
     assert found.residual_px == found.residual_px_given == pytest.approx(before)
     assert base.triangulations[-1] == 20.0
 
@@ -591,8 +599,8 @@ def test_a_frame_with_far_fewer_features_than_the_median_is_blurred(features, bl
     class Base(FakeBase):
         features = None
 
-        def __init__(self, work, K, sizes, threads):
-            super().__init__(len(sizes))
+        def __init__(self, work, cameras, threads):
+            super().__init__(len(cameras))
             assert work.is_dir() and threads == 3
 
         def extract(self, images):
@@ -611,10 +619,10 @@ def test_a_frame_with_far_fewer_features_than_the_median_is_blurred(features, bl
         return capture(given, given)
 
     monkeypatch.setattr(multiview, "_from_given", from_given)
-    frames = GivenFrames(NAMES[:4], FakeBase(4).K_given, E, [(640, 480)] * 4)
+    frames = GivenFrames(NAMES[:4], [Camera(K, (640, 480)) for K in FakeBase(4).K_given], E)
     for poses in ("refined", "given"):
         found = solve_capture(features, frames, poses=poses, threads=3)
-        codes = [note.code for note in found.notes]
+        codes = [finding.code for finding in found.findings]
         assert codes == (["capture.blurred"] if blurred else []) + ["capture.no-matches"]
-        assert not blurred or found.notes[0].startswith("frame 1: ")
+        assert not blurred or found.findings[0].startswith("frame 1: ")
     assert asked == [True, False]

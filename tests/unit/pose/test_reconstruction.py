@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.pose import reconstruction
 from geodiff_plugin.pose.reconstruction import Reconstruction, _features
 from tests.unit.pose.posed_scene import camera, pose, projected
@@ -35,7 +36,7 @@ FACTORS = np.array([0.5, 1.0, 0.5, 1.0])  # of the images that features are soug
 
 @pytest.fixture
 def base(tmp_path):
-    return Reconstruction(tmp_path, KS, SIZES, 1)
+    return Reconstruction(tmp_path, list(map(Camera, KS, SIZES)), 1)
 
 
 def points_in_front(count: int) -> np.ndarray:
@@ -105,13 +106,13 @@ def test_features_are_written_and_matches_read_in_pixels_of_their_frames(base, m
     points, made = synthetic_features()
     asked = []
 
-    def features(image, factor):
-        asked.append((image, factor))
+    def features(image, size):
+        asked.append((image, size))
         return made[image]
 
     monkeypatch.setattr(reconstruction, "_features", features)
     base.extract(range(4))
-    assert sorted(asked) == list(enumerate(FACTORS))
+    assert sorted(asked) == [(i, tuple(round(side * FACTORS[i]) for side in SIZES[i])) for i in range(4)]
     np.testing.assert_array_equal(base.features, [100, 101, 102, 103])
     with colmap.Database.open(tmp_path / "features.db") as database:
         cameras = {each.camera_id: each for each in database.read_all_cameras()}
@@ -127,8 +128,8 @@ def test_features_are_written_and_matches_read_in_pixels_of_their_frames(base, m
     for i, j, px_i, px_j in base.matches:
         assert len(px_i) == len(px_j) > 60
         for frame, px in ((i, px_i), (j, px_j)):
-            truth = projected(points, KS[frame], np.linalg.inv(E[frame]))
-            apart = np.linalg.norm(px[:, None] - truth, axis=2)
+            ground_truth = projected(points, KS[frame], np.linalg.inv(E[frame]))
+            apart = np.linalg.norm(px[:, None] - ground_truth, axis=2)
             assert np.median(apart.min(1)) < 0.5
         rows = [
             np.linalg.norm(
@@ -141,7 +142,7 @@ def test_features_are_written_and_matches_read_in_pixels_of_their_frames(base, m
 
 def test_points_are_triangulated_within_a_reprojection_error_and_poses_adjusted_to_them(base, monkeypatch):
     points, made = synthetic_features()
-    monkeypatch.setattr(reconstruction, "_features", lambda image, factor: made[image])
+    monkeypatch.setattr(reconstruction, "_features", lambda image, size: made[image])
     base.extract(range(4))
     base.match([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
     model = base.triangulated(base.model(E), 4.0)
@@ -195,9 +196,9 @@ class Recorded:
 
 
 def test_every_setting_of_matching_triangulation_and_adjustment_is_passed_on(tmp_path, monkeypatch):
-    base = Reconstruction(tmp_path, KS, SIZES, 3)
+    base = Reconstruction(tmp_path, list(map(Camera, KS, SIZES)), 3)
     recorded = Recorded("match_image_pairs", "triangulate_points", "create_pose_prior_bundle_adjuster")
-    monkeypatch.setattr(reconstruction, "_features", lambda image, factor: synthetic_features()[1][image])
+    monkeypatch.setattr(reconstruction, "_features", lambda image, size: synthetic_features()[1][image])
     base.extract(range(4))
     monkeypatch.setattr(reconstruction, "pycolmap", lambda: recorded)
     base.match([(0, 1), (2, 3)])
@@ -245,7 +246,7 @@ def test_every_setting_of_matching_triangulation_and_adjustment_is_passed_on(tmp
 def test_pycolmap_is_quiet_and_asked_for_if_it_is_missing(monkeypatch):
     assert reconstruction.pycolmap() is colmap and colmap.logging.minloglevel == 3  # fatal errors alone
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(InputError, match=r"pycolmap must be installed.*; got missing\. pip install"):
+    with pytest.raises(InputError, match=r"pycolmap must be installed.*; got missing\. Run pip install"):
         reconstruction.pycolmap()
 
 
@@ -270,7 +271,7 @@ def test_models_from_nothing_are_in_the_order_of_their_sizes(base, monkeypatch):
     assert options.min_model_size == 3 and not options.ba_refine_focal_length
     assert options.num_threads == 1 and not options.extract_colors
     for count, moves in ((19, False), (20, True)):
-        many = Reconstruction(base._work, np.repeat(KS[:1], count, 0), SIZES[:1] * count, 1)
+        many = Reconstruction(base._work, [Camera(KS[0], SIZES[0])] * count, 1)
         many.from_nothing()
         assert asked[-1].ba_refine_focal_length is moves
 
@@ -280,7 +281,7 @@ def test_features_of_a_frame_are_colmaps_pixels_scales_and_angles(factor):
     v, u = np.mgrid[:120, :160]
     x, y = 91.2, 47.6
     image = np.clip(40 + 180 * np.exp(-((u - x) ** 2 + 1.7 * (v - y) ** 2) / 128), 0, 255).astype(np.uint8)
-    px, descriptors = _features(image, factor)
+    px, descriptors = _features(image, (round(160 * factor), round(120 * factor)))
     assert px.dtype == np.float32 and descriptors.dtype == np.uint8 and px.shape[1:] == (4,)
     at = np.array([x + 0.5, y + 0.5]) * factor
     nearest = np.linalg.norm(px[:, :2] - at, axis=1).argmin()
@@ -297,7 +298,7 @@ def test_features_of_a_frame_are_colmaps_pixels_scales_and_angles(factor):
 def test_the_strongest_features_are_kept(monkeypatch):
     rng = np.random.default_rng(0)
     image = cv2.GaussianBlur(rng.integers(0, 256, (120, 160)).astype(np.uint8), (0, 0), 1.0)
-    every = _features(image, 1.0)[0]
-    monkeypatch.setattr(reconstruction, "MOST_FEATURES", 20)
-    px, descriptors = _features(image, 1.0)
+    every = _features(image, (160, 120))[0]
+    monkeypatch.setattr(reconstruction, "MAX_FEATURES", 20)
+    px, descriptors = _features(image, (160, 120))
     assert len(px) == len(descriptors) == 20 < len(every)

@@ -12,9 +12,9 @@ from geodiff_plugin.pose.solve import (
     PosePrior,
     depth_spread,
     nearby_poses,
-    regularised_poses,
+    regularized_poses,
     solve_poses,
-    undetermined_pose,
+    unconstrained_pose,
 )
 from geodiff_plugin.pose.tracks import (
     blocks,
@@ -27,7 +27,7 @@ from geodiff_plugin.pose.tracks import (
 from tests.unit.pose.posed_scene import K_RIGHTS, POSES, make_scene, moved, pose, projected
 
 #: Standard deviations that differ between views and between kinds of change.
-PRIOR = PosePrior(np.array([0.8, 1.7]), turned_rad=0.03, shifted_share=0.2, longer_share=0.07)
+PRIOR = PosePrior(np.array([0.8, 1.7]), rotation_rad=0.03, shift_fraction=0.2, length_fraction=0.07)
 
 
 def angles_deg(found: np.ndarray, Ts: np.ndarray) -> np.ndarray:
@@ -49,7 +49,7 @@ def test_derivatives_by_a_step_of_the_camera_are_differences(v):
     T, K, w = scene.Ts[v], K_RIGHTS[v], scene.inverse_depth
     found = solve._jacobian(project_tracks(scene.tracks.rays, w, K, T), w)
     for axis, step in enumerate(1e-6 * np.eye(6)):
-        np.testing.assert_allclose(solve._turned(T, 1e3 * step), moved(T, 1e3 * step), atol=1e-12)
+        np.testing.assert_allclose(solve._apply_step(T, 1e3 * step), moved(T, 1e3 * step), atol=1e-12)
         ahead, behind = (projected(scene.points, K, moved(T, way)) for way in (step, -step))
         np.testing.assert_allclose(found[..., axis], (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-4)
 
@@ -61,16 +61,16 @@ def prior_cost(scene, Ts, given, w, prior) -> float:
         seen = scene.tracks.seen[v]
         points = (scene.tracks.rays / w[:, None])[seen]
         px, px_before = (projected(points, K_RIGHTS[v], P) for P in (T, before))
-        total += ((px - px_before) ** 2).sum() / (seen.sum() * prior.moved_px[v] ** 2)
+        total += ((px - px_before) ** 2).sum() / (seen.sum() * prior.displacement_px[v] ** 2)
         change = T @ np.linalg.inv(before)
-        total += (Rotation.from_matrix(change[:3, :3]).magnitude() / prior.turned_rad) ** 2
+        total += (Rotation.from_matrix(change[:3, :3]).magnitude() / prior.rotation_rad) ** 2
         length, longer = np.linalg.norm(before[:3, 3]), np.linalg.norm(T[:3, 3])
-        total += (change[:3, 3] ** 2).sum() / (prior.shifted_share * length) ** 2
-        total += (np.log(longer / length) / prior.longer_share) ** 2
+        total += (change[:3, 3] ** 2).sum() / (prior.shift_fraction * length) ** 2
+        total += (np.log(longer / length) / prior.length_fraction) ** 2
     return total
 
 
-def stepped(Ts: np.ndarray, step: np.ndarray) -> np.ndarray:
+def discontinuity(Ts: np.ndarray, step: np.ndarray) -> np.ndarray:
     return np.stack([moved(T, step[6 * v : 6 * v + 6]) for v, T in enumerate(Ts)])
 
 
@@ -82,7 +82,7 @@ def test_the_cost_of_the_prior_has_the_stated_value_slope_and_curvature():
     assert found.cost == pytest.approx(prior_cost(scene, Ts, given, w, PRIOR), rel=1e-6)
     slopes = []
     for step in 1e-5 * np.eye(12):
-        ahead, behind = (prior_cost(scene, stepped(Ts, way), given, w, PRIOR) for way in (step, -step))
+        ahead, behind = (prior_cost(scene, discontinuity(Ts, way), given, w, PRIOR) for way in (step, -step))
         slopes.append((ahead - behind) / 2e-5)
     # Half the slope, since the cost is a sum of squares.
     np.testing.assert_allclose(
@@ -91,7 +91,7 @@ def test_the_cost_of_the_prior_has_the_stated_value_slope_and_curvature():
     at_given = solve._prior_terms(scene.tracks, given, given, w, PRIOR)
     assert at_given.cost == pytest.approx(0.0, abs=1e-12)
     for step in 1e-4 * np.random.default_rng(0).normal(size=(8, 12)):
-        cost = prior_cost(scene, stepped(given, step), given, w, PRIOR)
+        cost = prior_cost(scene, discontinuity(given, step), given, w, PRIOR)
         assert step @ at_given.normal @ step == pytest.approx(cost, rel=0.02)
 
 
@@ -121,7 +121,7 @@ def test_residuals_and_their_derivatives_describe_the_cost_near_a_pose(views, sc
     assert at.cost == pytest.approx(data_cost(scene, Ts, scale_px), rel=0.015)
     slopes = []
     for step in 1e-5 * np.eye(6 * views):
-        ahead, behind = (data_cost(scene, stepped(Ts, way), scale_px) for way in (step, -step))
+        ahead, behind = (data_cost(scene, discontinuity(Ts, way), scale_px) for way in (step, -step))
         slopes.append((ahead - behind) / 2e-5)
     gradient = np.einsum("nkp,nk->p", at.left_by_pose, at.residuals)
     np.testing.assert_allclose(gradient, np.array(slopes) / 2, atol=0.02 * np.abs(slopes).max())
@@ -129,7 +129,7 @@ def test_residuals_and_their_derivatives_describe_the_cost_near_a_pose(views, sc
     clean = make_scene(80, poses=POSES[:views])
     exact = solve._whitened(clean.tracks, clean.Ts, 1e3)
     for step in 1e-5 * np.random.default_rng(0).normal(size=(3, 6 * views)):
-        change = solve_inverse_depth(clean.tracks, stepped(clean.Ts, step)) - clean.inverse_depth
+        change = solve_inverse_depth(clean.tracks, discontinuity(clean.Ts, step)) - clean.inverse_depth
         np.testing.assert_allclose(-(exact.depth_by_pose @ step) / exact.slopes, change, atol=2e-7)
 
 
@@ -149,7 +149,7 @@ def test_depths_of_several_views_are_those_that_most_of_them_agree_on():
 @pytest.mark.parametrize("views", [1, 2])
 def test_solved_poses_are_a_minimum_of_the_stated_objective(views):
     scene = make_scene(70, noise_px=0.4, poses=POSES[:views], outliers=0.1, unseen=0.2)
-    prior = replace(PRIOR, moved_px=PRIOR.moved_px[:views])
+    prior = replace(PRIOR, displacement_px=PRIOR.displacement_px[:views])
     given, trust, scale_px = perturbed(scene.Ts, 0.4), 0.6, 0.8
     w_start = np.clip(solve_inverse_depth(scene.tracks, given), 1e-9, None)
 
@@ -161,7 +161,7 @@ def test_solved_poses_are_a_minimum_of_the_stated_objective(views):
     assert least < objective(given) and least < objective(scene.Ts)
     for axis, way in itertools.product(range(6 * views), (1, -1)):
         size = 2e-3 if axis % 6 < 3 else 2e-3
-        assert objective(stepped(found, way * size * np.eye(6 * views)[axis])) > least
+        assert objective(discontinuity(found, way * size * np.eye(6 * views)[axis])) > least
 
 
 def test_several_views_are_solved_alike_in_any_order_and_unit():
@@ -175,7 +175,7 @@ def test_several_views_are_solved_alike_in_any_order_and_unit():
         seen=scene.tracks.seen[::-1],
         K_rights=K_RIGHTS[::-1],
     )
-    other = replace(PRIOR, moved_px=PRIOR.moved_px[::-1])
+    other = replace(PRIOR, displacement_px=PRIOR.displacement_px[::-1])
     again = solve_poses(flipped, given[::-1], other, start=start[::-1])
     np.testing.assert_allclose(again[::-1], found, atol=1e-4)
     feet = [T.copy() for T in (given, start)]
@@ -217,7 +217,7 @@ def test_poses_near_the_given_ones_are_sought_from_far_and_then_from_near(monkey
     for call in calls:
         assert call["given"] is given
         np.testing.assert_allclose(
-            call["prior"].moved_px, [1.5 * before[0] + 0.05, 1.55]
+            call["prior"].displacement_px, [1.5 * before[0] + 0.05, 1.55]
         )  # unknown counts as 1 px
     calls.clear()
     nearby_poses(scene.tracks, given, np.array([0.2, 0.4]))
@@ -238,17 +238,17 @@ def test_poses_are_held_by_how_much_of_the_residual_they_explain(rig, turn_deg, 
     near = perturbed(scene.Ts, 0.5 * turn_deg, seed=4)
     before = median_residuals(tracks, given)
     calls = recorded(monkeypatch)
-    found, fitted = regularised_poses(tracks, given, near, before, rig)
+    found, fitted = regularized_poses(tracks, given, near, before, rig)
     free, *held = calls
     assert fitted is free["solved"] and found is held[-1]["solved"]
     assert free["start"] is near and free["scale_px"] == solve.SCALE_PX and free["trust"] == 1.0
-    assert (free["prior"].moved_px == solve.FREE_PX).all()
-    assert (free["prior"].turned_rad, free["prior"].longer_share) == (PosePrior(0).turned_rad, 0.02)
+    assert (free["prior"].displacement_px == solve.FREE_PX).all()
+    assert (free["prior"].rotation_rad, free["prior"].length_fraction) == (PosePrior(0).rotation_rad, 0.02)
     left = np.maximum(median_residuals(tracks, fitted), 0.05)
     explained = np.sqrt(np.maximum(before**2 - left**2, 0.0))
     parts = [split_residuals(tracks.alone(v), T) for v, T in enumerate(fitted)]
     times = explained / (5.6 * np.maximum([part.faults_px for part in parts], 0.03))
-    share = np.clip(times**4, 0.2, 40.0)
+    fraction = np.clip(times**4, 0.2, 40.0)
     wrong = not rig and (times > 1).any()
     assert (times > 1).any() == (turn_deg > 1)
     scales = np.maximum(np.mean(left) * np.array([2.0, 1.0, 0.5] if wrong else [2.0]), 0.1)
@@ -257,19 +257,19 @@ def test_poses_are_held_by_how_much_of_the_residual_they_explain(rig, turn_deg, 
     for call, start in zip(held, starts, strict=False):
         assert call["given"] is given and call["start"] is start
         assert call["trust"] == pytest.approx(0.5 * np.mean([part.trust for part in parts]))
-        prior, expected = call["prior"], np.maximum(explained * (0.4 if rig else share), 0.05)
-        np.testing.assert_allclose(prior.moved_px, expected, rtol=1e-6)
+        prior, expected = call["prior"], np.maximum(explained * (0.4 if rig else fraction), 0.05)
+        np.testing.assert_allclose(prior.displacement_px, expected, rtol=1e-6)
         spreads = (np.radians(0.3), 0.01) if rig else (np.radians(1.5), 0.1)
-        assert (prior.turned_rad, prior.shifted_share) == pytest.approx(spreads)
-        assert prior.longer_share == 0.05
+        assert (prior.rotation_rad, prior.shift_fraction) == pytest.approx(spreads)
+        assert prior.length_fraction == 0.05
 
 
-def test_a_view_without_matches_keeps_its_pose_beside_one_that_is_refined():
+def test_a_view_without_matches_keeps_its_pose_if_another_is_refined():
     scene = make_scene(120, noise_px=0.2)
     scene.tracks.seen[1] = False
     given = perturbed(scene.Ts, 0.8)
     before = median_residuals(scene.tracks, given)
-    found, _ = regularised_poses(scene.tracks, given, given, before, False)
+    found, _ = regularized_poses(scene.tracks, given, given, before, False)
     assert angles_deg(found, scene.Ts)[0] < 0.15 < 0.5 < angles_deg(given, scene.Ts)[0]
     np.testing.assert_allclose(found[1], given[1], atol=1e-9)
 
@@ -323,6 +323,8 @@ def test_the_spread_of_depth_is_the_sandwich_over_blocks_with_the_unit_held(view
 
 
 def test_a_spread_of_more_than_six_per_cent_is_reported_with_its_size():
-    assert undetermined_pose(None) == () and undetermined_pose(0.0599) == () and undetermined_pose(0.06) == ()
-    (message,) = undetermined_pose(0.0712)
-    assert message.code == "estimate.undetermined" and "7 %" in message
+    assert (
+        unconstrained_pose(None) == () and unconstrained_pose(0.0599) == () and unconstrained_pose(0.06) == ()
+    )
+    (message,) = unconstrained_pose(0.0712)
+    assert message.code == "estimate.unconstrained" and "7 %" in message

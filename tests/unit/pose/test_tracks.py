@@ -1,6 +1,5 @@
 """Tracks: projection, epipolar lines, inverse depth and shared errors; features, flow, and their pixels."""
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.pose import tracks as tracks_module
 from geodiff_plugin.pose.tracks import (
     Tracks,
-    behind_infinity,
     blocks,
     coarse_depth,
     dense_tracks,
@@ -29,7 +28,6 @@ from geodiff_plugin.pose.tracks import (
     sparse_tracks,
     split_residuals,
 )
-from geodiff_plugin.types import CameraView, PosedViews
 from tests.tiny import render_plane
 from tests.unit.pose.posed_scene import (
     K_LEFT,
@@ -41,6 +39,7 @@ from tests.unit.pose.posed_scene import (
     pose,
     projected,
 )
+from tests.views import grey_of, posed_of
 
 VIEWS = pytest.mark.parametrize("v", [0, 1])
 SKEWED = (K_LEFT + [[0, 2.5, 0], [0, 0, 0], [0, 0, 0]], K_RIGHTS + [[0, -4.0, 0], [0, 0, 0], [0, 0, 0]])
@@ -175,36 +174,6 @@ def test_blocks_are_a_tenth_of_the_width_and_numbered_row_by_row():
     np.testing.assert_array_equal(blocks(scene.tracks), expected.ravel())
 
 
-def behind_scene(px_behind, px_off):
-    """Per view 100 matches; the first are so many pixels beyond infinity, and so many off their line."""
-    scene = make_scene(100)
-    for v, (K, T) in enumerate(zip(K_RIGHTS, scene.Ts, strict=True)):
-        infinity, further = (projected(scene.tracks.rays * z, K, T) for z in (1e12, 1e4))
-        along = further - infinity
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-        count = len(px_behind)
-        scene.tracks.right_px[v, :count] = infinity[:count] - px_behind[:, None] * along[:count]
-        scene.tracks.right_px[v, :count] += px_off[:, None] * across[:count]
-    return scene
-
-
-def test_matches_beyond_infinity_are_counted_over_all_views_if_they_are_on_their_lines():
-    px_behind = np.r_[np.full(6, 0.95), np.linspace(1.05, 9.0, 12), 50.0]
-    px_off = np.r_[np.zeros(18), 2.05]  # the last one is a wrong match
-    px_off[3:9] = 1.95
-    scene = behind_scene(px_behind, px_off)
-    found = behind_infinity(scene.tracks, scene.Ts)
-    beyond = np.r_[np.where(px_behind > 1.0, px_behind, 0.0)[:18], np.zeros(81)]
-    assert found.share == pytest.approx(12 / 99)
-    assert found.px == pytest.approx(np.quantile(np.r_[beyond, beyond], 0.97), abs=1e-4)
-    few = replace(scene.tracks, seen=scene.tracks.seen & (np.arange(100) >= 80))
-    assert behind_infinity(few, scene.Ts) == (0.0, 0.0)
-    few.seen[1, -1] = False
-    fewer = behind_infinity(replace(few), scene.Ts)
-    assert math.isnan(fewer.share) and math.isnan(fewer.px)
-
-
 @VIEWS
 def test_residuals_are_split_into_own_noise_and_errors_that_neighbours_share(v):
     scene, rng = make_scene(4000, seed=v), np.random.default_rng(v)
@@ -249,16 +218,17 @@ def test_a_shrunk_image_keeps_its_outer_edges_and_its_brightness(channels):
     """Sizes do not divide evenly: 101 x 67 becomes 40 x 27."""
     image = torch.full((channels, 67, 101), 0.25)
     image[:, :33] = 0.75
-    K = torch.tensor(camera(90.0, 110.0, 47.0, 36.0))
-    grey, shrunk = grey_image(image, K, 0.4)
+    K = camera(90.0, 110.0, 47.0, 36.0)
+    grey, shrunk, _ = grey_image(image, Camera(K), 0.4)
     assert grey.shape == (27, 40) and grey.dtype == np.uint8
     assert (grey[:13] == 191).all() and (grey[14:] == 64).all()
     for corner, at in (((-0.5, -0.5), (-0.5, -0.5)), ((100.5, 66.5), (39.5, 26.5))):
-        rays = [np.linalg.solve(k, [*px, 1.0]) for k, px in ((K.numpy(), corner), (shrunk, at))]
+        rays = [np.linalg.solve(k, [*px, 1.0]) for k, px in ((K, corner), (shrunk.K, at))]
         np.testing.assert_allclose(*rays)
-    same, K_same = grey_image(image, K, 1.0)
-    assert same.shape == (67, 101) and np.array_equal(K_same, K.numpy())
-    assert grey_image(image[:, :2], K, 0.2)[0].shape == (1, 20)
+    assert shrunk.size == (40, 27)
+    same, camera_same, _ = grey_image(image, Camera(K), 1.0)
+    assert same.shape == (67, 101) == camera_same.size[::-1] and np.array_equal(camera_same.K, K)
+    assert grey_image(image[:, :2], Camera(K), 0.2).grey.shape == (1, 20)
 
 
 @pytest.mark.parametrize(
@@ -272,17 +242,13 @@ def test_a_shrunk_image_keeps_its_outer_edges_and_its_brightness(channels):
 )
 def test_right_images_are_shrunk_to_the_pixels_per_radian_of_the_left_one(right, focal, expected):
     """The left image is 1,000 px wide with a focal length of 1,000 px, of which 832 are used."""
-    left, K_left = torch.zeros(3, 10, 1000), torch.tensor(camera(1000.0, 990.0, 480.0, 4.0))
-    K_right = torch.tensor(camera(focal, 1.1 * focal, right[1] / 2, 5.0))
-    same = CameraView(torch.zeros(3, 10, 500), K_left, torch.eye(4))
-    views = grey_views(
-        PosedViews(left, (CameraView(torch.zeros(3, *right), K_right, torch.eye(4)), same), K_left)
-    )
-    assert [grey.shape for grey, _ in views] == [(8, 832), expected, (8, 416)]
-    for (grey, K), K_given, width in zip(
-        views, (K_left, K_right, K_left), (1000, right[1], 500), strict=True
-    ):
-        assert K[0, 0] == pytest.approx(float(K_given[0, 0]) * grey.shape[1] / width)
+    K_left, K_right = camera(1000.0, 990.0, 480.0, 4.0), camera(focal, 1.1 * focal, right[1] / 2, 5.0)
+    rights = (torch.zeros(3, *right), K_right, np.eye(4)), (torch.zeros(3, 10, 500), K_left, np.eye(4))
+    views = grey_views(posed_of(torch.zeros(3, 10, 1000), K_left, *rights))
+    assert [view.grey.shape for view in views] == [(8, 832), expected, (8, 416)]
+    each = zip(views, (K_left, K_right, K_left), (1000, right[1], 500), strict=True)
+    for (grey, shrunk, _), K_given, width in each:
+        assert shrunk.K[0, 0] == pytest.approx(K_given[0, 0] * grey.shape[1] / width)
 
 
 def blob(size: tuple[int, int], x: float, y: float, sigma: float = 4.0) -> np.ndarray:
@@ -361,7 +327,7 @@ def test_sparse_matches_of_several_views_are_in_pixels_of_each_image(scale):
     whole = speckles((170, 230), sigma=3.0)
     corners, ends = ((12, 9), (3, 20), (110, 4)), ((207, 151), (229, 169), (201, 166))
     cuts = [whole[y:y1, x:x1] for (x, y), (x1, y1) in zip(corners, ends, strict=True)]
-    views = [(np.ascontiguousarray(cut), K) for cut, K in zip(cuts, (K_LEFT, *K_RIGHTS), strict=True)]
+    views = [grey_of(np.ascontiguousarray(cut), K) for cut, K in zip(cuts, (K_LEFT, *K_RIGHTS), strict=True)]
     tracks = sparse_tracks(views, scale)
     np.testing.assert_array_equal(tracks.K_left, K_LEFT)
     np.testing.assert_array_equal(tracks.K_rights, K_RIGHTS)
@@ -375,11 +341,11 @@ def test_sparse_matches_of_several_views_are_in_pixels_of_each_image(scale):
 
 
 def test_pixels_of_a_small_image_keep_the_outer_edges_of_the_large_one():
-    large, small = np.zeros((101, 203)), tracks_module._shrunk(np.zeros((101, 203), np.uint8), 0.25)
+    large, small = np.zeros((101, 203)), tracks_module._downscaled(np.zeros((101, 203), np.uint8), 0.25)
     assert small.shape == (25, 51)
-    found = tracks_module._enlarged(np.array([[-0.5, -0.5], [50.5, 24.5], [25.0, 12.0]]), small, large)
+    found = tracks_module._upscaled(np.array([[-0.5, -0.5], [50.5, 24.5], [25.0, 12.0]]), small, large)
     np.testing.assert_allclose(found, [[-0.5, -0.5], [202.5, 100.5], [101.0, 50.0]])
-    assert tracks_module._shrunk(np.zeros((4, 50), np.uint8), 0.1).shape == (1, 5)
+    assert tracks_module._downscaled(np.zeros((4, 50), np.uint8), 0.1).shape == (1, 5)
 
 
 def test_flow_leads_from_each_pixel_of_the_source_to_the_target():
@@ -468,7 +434,7 @@ def plane_views():
 def test_dense_matches_of_several_views_are_where_the_scene_has_them():
     images, depth = plane_views()
     views = [
-        (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), K)
+        grey_of(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), K)
         for image, K in zip(images, (PLANE_K, *PLANE_K_RIGHTS), strict=True)
     ]
     Ts = np.linalg.inv(PLANE_POSES)
@@ -496,7 +462,7 @@ def test_dense_matches_of_several_views_are_where_the_scene_has_them():
 def test_flow_is_asked_only_where_a_right_image_shows_what_is_in_front_of_its_camera(monkeypatch):
     images, depth = plane_views()
     greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
-    views = list(zip(greys, (PLANE_K, *PLANE_K_RIGHTS), strict=True))
+    views = [grey_of(*each) for each in zip(greys, (PLANE_K, *PLANE_K_RIGHTS), strict=True)]
     v, u = np.mgrid[:90, :120]
     points = np.linalg.solve(PLANE_K, np.stack([u, v, np.ones_like(u)]).reshape(3, -1)).T * depth.reshape(
         -1, 1
@@ -544,7 +510,7 @@ def test_a_rough_depth_spreads_confident_matches_into_holes(monkeypatch):
     confidence[2:7, 3:8] = 0.0
     inverse[:, 9:] = 0.0  # the sky: no depth is further than a thousand times the nearest one
     found = Matches(*(torch.from_numpy(each)[None] for each in (inverse, confidence)))
-    monkeypatch.setattr(tracks_module, "pilot_volume", lambda posed: posed)
+    monkeypatch.setattr(tracks_module, "coarse_volume", lambda posed: posed)
     monkeypatch.setattr(tracks_module, "match_volume", lambda volume: found)
     depth = coarse_depth("views", (9, 11))[0, 0].numpy()
     spread = plain_spread(inverse, confidence**2 + 1e-9)
@@ -566,12 +532,31 @@ class Matches(NamedTuple):
 def test_the_rough_depth_is_that_of_the_scene_without_holes():
     images, depth = plane_views()
     tensors = [torch.from_numpy(image).permute(2, 0, 1).float() / 255 for image in images]
-    Ts = torch.from_numpy(np.linalg.inv(PLANE_POSES)).float()
-    rights = tuple(
-        CameraView(image, torch.from_numpy(K).float(), T)
-        for image, K, T in zip(tensors[1:], PLANE_K_RIGHTS, Ts, strict=True)
-    )
-    found = coarse_depth(PosedViews(tensors[0], rights, torch.from_numpy(PLANE_K).float()), (45, 60))
+    rights = zip(tensors[1:], PLANE_K_RIGHTS, np.linalg.inv(PLANE_POSES), strict=True)
+    found = coarse_depth(posed_of(tensors[0], PLANE_K, *rights), (45, 60))
     assert found.shape == (1, 1, 45, 60) and (found > 0).all()
     ratio = found[0, 0].numpy() / depth.reshape(45, 2, 60, 2).mean((1, 3))
     assert np.median(ratio) == pytest.approx(1.0, abs=0.03) and np.quantile(np.abs(ratio - 1), 0.9) < 0.12
+
+
+def test_dark_images_are_stretched_and_others_are_matched_as_they_are():
+    """A twelfth of the light, in whole grey levels with noise: the same places are found again."""
+    rng = np.random.default_rng(4)
+    bright = speckles((240, 320), seed=2, sigma=2.5)
+    dark = np.clip(np.rint(bright * 0.12 + rng.normal(size=bright.shape) * 0.7), 0, 255).astype(np.uint8)
+    found, plain = (
+        len(match_features(sift_features(bright), other))
+        for other in (sift_features(dark), _plain_features(dark))
+    )
+    assert found > 60 and found > 1.3 * plain
+    for level in (64, 255):  # the brightest percent decides
+        image = np.minimum(bright, level).astype(np.uint8)
+        assert tracks_module._stretched_if_dark(image) is image
+    stretched = tracks_module._stretched_if_dark(np.minimum(bright, 63))
+    assert stretched.max() == 255 and stretched.min() == 0 and stretched.dtype == np.uint8
+
+
+def _plain_features(grey):
+    points, descriptors = cv2.SIFT.create(nfeatures=4000, contrastThreshold=0.01).detectAndCompute(grey, None)
+    root = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
+    return cv2.KeyPoint.convert(points), root

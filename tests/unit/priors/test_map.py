@@ -140,9 +140,31 @@ def test_steep_edges_stay_steep_where_a_map_is_enlarged():
         (make_map(0, SIZE[::-1]), ValueError, "36x24 pixels; got 24x36 pixels. Is it transposed"),
     ],
 )
-def test_what_is_no_map_of_the_image_is_refused(pipe, given, error, words):
+def test_a_non_map_of_the_image_is_rejected(pipe, given, error, words):
     with pytest.raises(error, match=words):
         condition(pipe, given)
+
+
+def test_a_small_range_far_from_0_survives_in_double_precision(pipe):
+    values = 1e7 + 1e-3 * make_map()
+    np.testing.assert_allclose(condition(pipe, values)[0, 0], unit(values), atol=1e-3)
+    assert condition(pipe, np.asfortranarray(values[:, ::-1])[:, ::-1]).isfinite().all()
+    assert module._from_zero(make_map()[:2, :2]).shape == (1, 1, 2, 2)
+
+
+@pytest.mark.parametrize("factor", [0.4, 1.4, 1.5, 2.0])
+def test_edges_are_made_steep_again_from_half_as_large_again_on(monkeypatch, factor):
+    """In a stand-in for inverse depth that is positive where the map is."""
+    asked = []
+    monkeypatch.setattr(module, "sharpen_edges", lambda *given: asked.append(given) or given[0])
+    small, left = torch.rand(1, 1, 20, 30), torch.rand(1, 3, round(20 * factor), 28)
+    found = module._resized(small, left)
+    wanted = torch.nn.functional.interpolate(small, left.shape[-2:], mode="bilinear", antialias=True)
+    torch.testing.assert_close(found, wanted)
+    assert bool(asked) is (factor >= 1.5)
+    for inverse, image, radius in asked:
+        torch.testing.assert_close(inverse, 1 / (wanted + module.OFFSET))
+        assert image is left and radius == 2
 
 
 def test_a_square_map_and_one_of_nearly_the_same_shape_are_taken(pipe):

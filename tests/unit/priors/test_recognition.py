@@ -68,7 +68,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("adapter", "configs", "index", "expected"), CASES)
-def test_a_folder_is_recognised_by_each_entry_that_tells_it(tmp_path, adapter, configs, index, expected):
+def test_a_folder_is_recognised_by_each_of_its_typical_entries(tmp_path, adapter, configs, index, expected):
     for name, config in configs.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text(json.dumps(config))

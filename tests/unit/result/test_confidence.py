@@ -6,11 +6,12 @@ import torch
 import torch.nn.functional as F
 from scipy.ndimage import generic_filter, map_coordinates, maximum_filter, minimum_filter
 
-from geodiff_plugin import _strips as strips
+from geodiff_plugin._internal import strips
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.result.confidence import Grounds, depth_confidence, determined, grounds_of, reprojection
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.result.confidence import data_support, depth_confidence, features_of, reprojection
+from geodiff_plugin.result.records import ConfidenceFeatures
+from tests.views import view_of
 
 
 def resized(x: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -23,13 +24,13 @@ def as_map(x: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.asarray(x))[None, None].float()
 
 
-def mean_around(x: np.ndarray, reach: int) -> np.ndarray:
+def mean_around(x: np.ndarray, radius: int) -> np.ndarray:
     """The mean over the part of a square window that lies in the map."""
-    return generic_filter(x, np.nanmean, 2 * reach + 1, mode="constant", cval=np.nan)
+    return generic_filter(x, np.nanmean, 2 * radius + 1, mode="constant", cval=np.nan)
 
 
 @pytest.mark.parametrize("matched", [0.6, 0.0])
-def test_grounds_are_window_means_on_the_grid_of_the_matches(matched):
+def test_features_are_window_means_on_the_grid_of_the_matches(matched):
     """Map, matches and support have three sizes; a fit lowered some depths and raised others."""
     rng = np.random.default_rng(0)
     full, grid = (35, 70), (34, 45)
@@ -42,17 +43,17 @@ def test_grounds_are_window_means_on_the_grid_of_the_matches(matched):
     confidence[rng.random(grid) < 0.05 * matched] = 9.0  # known points
     support = as_map(rng.random((48, 66)))
     target = Matches(as_map(inverse), as_map(confidence), torch.tensor([0.004]))
-    found = grounds_of(as_map(denoised), as_map(depth), target, support)
+    found = features_of(as_map(denoised), as_map(depth), target, support)
     planes = np.minimum(np.abs(inverse - np.exp(-on_grid)) / 0.004, 10.0)
     weight, distance, change = (
         mean_around(x, 15) for x in (confidence, confidence * planes, np.abs(on_grid - before))
     )
     known = np.minimum(confidence, 1.0).mean()
-    share = known / (known + 0.02)
+    fraction = known / (known + 0.02)
     expected = {
-        "apart": (distance + 0.02 * 10.0) / (weight + 0.02),
-        "moved": np.clip(change, 0.005, 0.2) ** share * 0.2 ** (1 - share),
-        "stepped": maximum_filter(on_grid, 9) - minimum_filter(on_grid, 9),
+        "residual": (distance + 0.02 * 10.0) / (weight + 0.02),
+        "change": np.clip(change, 0.005, 0.2) ** fraction * 0.2 ** (1 - fraction),
+        "discontinuity": maximum_filter(on_grid, 9) - minimum_filter(on_grid, 9),
     }
     assert found.support is support
     for name, values in expected.items():
@@ -62,20 +63,22 @@ def test_grounds_are_window_means_on_the_grid_of_the_matches(matched):
 
 def test_matches_determine_a_depth_from_a_third_of_what_they_could_know():
     known = np.random.default_rng(1).uniform(0, 0.7, (9, 14))
-    found = determined(as_map(known), (21, 25))[0, 0].numpy()
+    found = data_support(as_map(known), (21, 25))[0, 0].numpy()
     np.testing.assert_allclose(found, resized(np.minimum(known / 0.33, 1.0), (21, 25)), rtol=1e-5)
 
 
-def probability(support, apart, moved, stepped, spread, error) -> np.ndarray:
+def probability(support, residual, change, discontinuity, spread, error) -> np.ndarray:
     """The logistic model of five features; 0.5 is the error of a useless prior."""
-    share = support / (support + 0.1)
-    left = (1 - support) * np.clip(error, 0.01, 0.5) ** share * 0.5 ** (1 - share)
+    fraction = support / (support + 0.1)
+    left = (1 - support) * np.clip(error, 0.01, 0.5) ** fraction * 0.5 ** (1 - fraction)
     odds = (
         -2.95
         + 0.36 * np.log(0.05 / np.clip(left, 0.0005, 0.05))
-        + 1.04 * np.log(10 / np.clip(apart, 0.5, 10))
+        + 1.04 * np.log(10 / np.clip(residual, 0.5, 10))
     )
-    odds += 0.94 * np.log(0.2 / np.clip(moved, 0.005, 0.2)) + 0.36 * np.log(0.5 / np.clip(stepped, 0.01, 0.5))
+    odds += 0.94 * np.log(0.2 / np.clip(change, 0.005, 0.2)) + 0.36 * np.log(
+        0.5 / np.clip(discontinuity, 0.01, 0.5)
+    )
     return 1 / (1 + np.exp(15.0 * spread - odds))
 
 
@@ -86,7 +89,7 @@ def test_confidence_is_a_logistic_model_of_five_features(monkeypatch, has_spread
     rng, size = np.random.default_rng(2), (25, 31)
     support = rng.random(size) ** 0.2
     support[:5] **= 20
-    grounds = [
+    features = [
         support,
         *(np.exp(rng.uniform(*np.log(ends), size)) for ends in ((0.2, 20), (2e-3, 0.5), (4e-3, 1.2))),
     ]
@@ -96,8 +99,11 @@ def test_confidence_is_a_logistic_model_of_five_features(monkeypatch, has_spread
     if error is not None:
         at = [((np.arange(n) + 0.5) * old / n).astype(int) for n, old in zip(size, of_prior, strict=True)]
         expected_error = error[np.ix_(*at)]
-    expected = probability(*grounds, 0.0 if spread is None else spread, expected_error)
-    given = Grounds(*map(as_map, grounds)), *(None if x is None else as_map(x) for x in (spread, error))
+    expected = probability(*features, 0.0 if spread is None else spread, expected_error)
+    given = (
+        ConfidenceFeatures(*map(as_map, features)),
+        *(None if x is None else as_map(x) for x in (spread, error)),
+    )
     np.testing.assert_allclose(depth_confidence(*given)[0, 0], expected, rtol=1e-4)
     monkeypatch.setattr(strips, "STRIP_PIXELS", 4 * size[1])  # strips of 4 of 25 rows
     np.testing.assert_allclose(depth_confidence(*given)[0, 0], expected, rtol=1e-4)
@@ -159,12 +165,8 @@ def test_the_least_photometric_error_of_the_views_that_see_a_pixel(monkeypatch, 
         matched = match_exposure(*tensors, torch.from_numpy(visible)[None, None])
         errors.append(np.where(visible, np.abs(matched[0].numpy() - left).mean(0), np.inf))
         seen.append(visible)
-    given = [
-        CameraView(torch.from_numpy(i), *(torch.from_numpy(m).float() for m in (K, T))) for i, K, T in views
-    ]
-    visible, error = reprojection(
-        given, as_map(depth), torch.from_numpy(left)[None], torch.from_numpy(K_left)[None].float()
-    )
+    given = [view_of(torch.from_numpy(image), K, T) for image, K, T in views]
+    visible, error = reprojection(given, as_map(depth), view_of(torch.from_numpy(left), K_left))
     any_sees, least = np.any(seen, 0), np.min(errors, 0)
     assert 0.3 < any_sees.mean() < 0.99 and all(0.1 < each.mean() < 0.9 for each in seen)
     assert visible.dtype == torch.bool and (visible[0, 0].numpy() == any_sees).mean() > 0.995

@@ -8,24 +8,46 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from PIL import Image
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin._threads import BackgroundTask
-from geodiff_plugin.algorithm.correction import DepthFit
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.algorithm.match_fitting import DepthFit
 from geodiff_plugin.algorithm.member import Member
+from geodiff_plugin.cameras import PosedViews
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.matching import Matches, known_share
-from geodiff_plugin.matching.rows import RowChecks, RowMatches
-from geodiff_plugin.messages import Message
+from geodiff_plugin.findings import Finding
+from geodiff_plugin.matching import Matches, known_fraction
+from geodiff_plugin.matching.rows import RowMatches
 from geodiff_plugin.result import finish as module
-from geodiff_plugin.result.confidence import depth_confidence, determined, reprojection
+from geodiff_plugin.result.confidence import data_support, depth_confidence, reprojection
+from geodiff_plugin.result.expected_error import remaining_confidence
 from geodiff_plugin.result.finish import ResultOptions, finish, refine
-from geodiff_plugin.result.misfit import misfit_of, share_left
-from geodiff_plugin.result.verdict import points_agreement
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.scale.space import MetricMap
-from geodiff_plugin.types import CameraView, PosedViews, PoseReport
+from geodiff_plugin.trust import (
+    Call,
+    FactSheet,
+    KnownPoints,
+    MatchedFraction,
+    PosesStage,
+    confidence_factor,
+    match_error,
+    measure,
+)
+from geodiff_plugin.trust.length_units import LengthUnits
+from geodiff_plugin.trust.letterbox import Letterbox, LetterboxWidth
+from geodiff_plugin.trust.prior_correlation import PriorCorrelation
+from geodiff_plugin.trust.prior_scale import PriorScale
+from geodiff_plugin.trust.search_edge import SearchEdge
+from geodiff_plugin.trust.search_range import SearchRange
+from geodiff_plugin.types import PoseReport
+from tests.contracts.tiny_transformers import make_transformers
+from tests.scenes import render_pair
+from tests.views import view_of
+
+END_TO_END = pytest.mark.end_to_end
 
 NATIVE, GRID, PROCESSING, OUTPUT = (50, 64), (26, 40), (24, 32), (42, 60)
 K = torch.tensor([[60.0, 0.5, 30.0], [0, 52.0, 26.0], [0, 0, 1]])
@@ -86,9 +108,9 @@ def evidence_of(*, views: bool = True, far_m: float = 1e3, **parts) -> Evidence:
         torch.tensor([[0, -0.05, 0.1], [0.05, 0, -0.02], [-0.1, 0.02, 0.0]])
     )
     rights = tuple(
-        CameraView(*each) for each in zip(images[1:], (K, 0.9 * K + 0.1 * torch.eye(3)), T, strict=True)
+        view_of(*each) for each in zip(images[1:], (K, 0.9 * K + 0.1 * torch.eye(3)), T, strict=True)
     )
-    native = PosedViews(images[0], rights if views else (), K)
+    native = PosedViews(view_of(images[0], K), rights if views else ())
     volume = (
         SimpleNamespace(reach_m=(0.5, far_m), inverse_depth=torch.linspace(0.01, 1.0, 80)) if views else None
     )
@@ -141,23 +163,28 @@ def test_the_order_of_members_does_not_matter():
         torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-4, atol=1e-5)
     for name in ("scale", "shift", "global_scale", "over_prior"):
         torch.testing.assert_close(getattr(one, name)[order], getattr(other, name))
-    assert one.verdict.indicators.rank_correlation == pytest.approx(other.verdict.indicators.rank_correlation)
+    correlations = [each.verdict.facts[PriorCorrelation].rank_correlation for each in (one, other)]
+    assert correlations[0] == pytest.approx(correlations[1])
 
 
 @pytest.mark.parametrize(("far_m", "ratio"), [(1e3, 1.0), (4.2, 1.15)])
 def test_every_field_is_made_of_its_own_stage(far_m, ratio):
     """With points that contradict matches, a pose that does not fit, and depth beyond the cameras' reach."""
-    report = PoseReport("refined", (), (), residual_px=(1.2,), residual_px_given=(3.0,), scale_spread=0.05)
-    evidence = evidence_of(far_m=far_m, points=points_of(ratio), report=BackgroundTask.known(report))
-    options = ResultOptions(DEFAULT, doubts=(Message("camera.scaled", "K."),), centre_assumed=True)
+    report = PoseReport("refined", (), (), residual_px=(1.2,), residual_px_given=(3.0,), scale_rel_std=0.05)
+    of_poses = measure(PosesStage(report, None, np.eye(4)[None], NATIVE))
+    evidence = evidence_of(far_m=far_m, points=points_of(ratio), report=report, points_outside=4)
+    evidence = replace(evidence, facts=of_poses | FactSheet({Letterbox: LetterboxWidth(0.1)}))
+    doubt = Finding("calibration.assumed-metres", "Metres?")
+    options = ResultOptions(DEFAULT, call=Call(findings=(doubt,)))
     found = finish(evidence, MEMBERS, merged(MEMBERS), torch.ones(1, 1, *OUTPUT), options)
-    left = resized(evidence.native.left_01[None], OUTPUT, antialias=True)
+    left = resized(evidence.native.left.image_01[None], OUTPUT, antialias=True)
     of_all = refine(evidence, MEMBERS, merged(MEMBERS), left, DEFAULT)
     torch.testing.assert_close(found.depth_m, of_all.depth_m.clamp(max=far_m), rtol=1e-5, atol=0)
     scale = torch.tensor([OUTPUT[1] / NATIVE[1], OUTPUT[0] / NATIVE[0], 1.0])
     expected_K = scale[:, None] * K
     expected_K[:2, 2] += 0.5 * scale[:2] - 0.5
-    torch.testing.assert_close(found.K, expected_K)
+    assert found.camera.size == OUTPUT[::-1]
+    np.testing.assert_allclose(found.camera.K, expected_K, rtol=1e-6)
     relative = np.median(torch.cat([each.relative for each in MEMBERS]).numpy(), 0)[None]
     torch.testing.assert_close(found.relative, resized(torch.from_numpy(relative), OUTPUT))
     for name, number in (("scale", "scale"), ("shift", "shift"), ("global_scale", "g_s")):
@@ -167,27 +194,30 @@ def test_every_field_is_made_of_its_own_stage(far_m, ratio):
     valid = torch.cat([each.valid for each in MEMBERS]).any(0)[None]
     torch.testing.assert_close(found.prior_error, torch.where(valid, errors, 0.5))
     torch.testing.assert_close(found.support, of_all.support)
-    visible, error = reprojection(evidence.native.views, found.depth_m, left, found.K[None])
+    left_view = evidence.native.left.resized(OUTPUT)
+    visible, error = reprojection(evidence.native.rights, found.depth_m, left_view)
     assert torch.equal(found.visible, visible) and torch.equal(found.photometric_error, error)
-    assert (
-        found.visible_share == pytest.approx(float(visible.float().mean())) and 0.3 < found.visible_share < 1
-    )
+    seen = found.verdict.facts
+    fraction = seen[MatchedFraction].visible
+    assert fraction == pytest.approx(float(visible.float().mean())) and 0.3 < fraction < 1
     over = resized(found.depth_m, PROCESSING) / torch.cat([each.prior_depth_m for each in MEMBERS]).clamp_min(
         1e-6
     )
     torch.testing.assert_close(found.over_prior, over.flatten(1))
-    before = depth_confidence(of_all.grounds, found.uncertainty / found.depth_m, found.prior_error)
-    seen = found.verdict.indicators
-    misfit = misfit_of(seen, NATIVE)
-    kept = points_agreement(seen) * (found.depth_m < far_m)
-    kept = kept * share_left(found.depth_m, found.K, evidence.native.views, misfit)
-    assert misfit.px > 0.5 and misfit.relative > 0 and (points_agreement(seen) < 1) == (ratio > 1.1)
+    before = depth_confidence(of_all.features, found.uncertainty / found.depth_m, found.prior_error)
+    error, factor = match_error(seen), confidence_factor(seen)
+    kept = factor * (found.depth_m < far_m)
+    kept = kept * remaining_confidence(found.depth_m, found.camera, evidence.native.rights, error)
+    assert error.px > 0.5 and error.relative > 0 and (factor < 1) == (ratio > 1.1)
     assert ((found.confidence == 0).any() and (found.depth_m == far_m).any()) == (far_m == 4.2)
     torch.testing.assert_close(found.confidence, before * kept, rtol=1e-4, atol=1e-6)
-    assert seen.confidence == pytest.approx(float(before.mean()), rel=1e-5)
-    assert seen.rank_correlation == pytest.approx(0.6) and seen.on_edge and seen.centre_assumed
-    assert seen.prior_ratio == pytest.approx(float(np.quantile(over, 0.5, method="lower")))
-    assert seen.doubts == options.doubts and not seen.range_given
+    assert seen[MatchedFraction].confidence == pytest.approx(float(before.mean()), rel=1e-5)
+    assert seen[PriorCorrelation].rank_correlation == pytest.approx(0.6) and seen[SearchEdge].on_edge
+    assert seen[PriorScale].ratio == pytest.approx(float(np.quantile(over, 0.5, method="lower")))
+    assert seen.call is options.call and doubt in found.verdict.reasons
+    assert (seen[KnownPoints].count, seen[KnownPoints].outside) == (90, 4)
+    for check in (*of_poses.as_record(), Letterbox.name()):
+        assert seen.as_record()[check] == evidence.facts.as_record()[check], "the facts of act 1 are kept"
     assert found.evidence is evidence and len({found}) == 1
     for record, field in ((found, "depth_m"), (options, "config")):
         with pytest.raises(FrozenInstanceError):
@@ -202,8 +232,9 @@ def test_numbers_that_no_member_has_stay_unknown():
         "error": None,
     }
     found = finish(evidence_of(), [member(1, **nothing)], merged(MEMBERS), None, ResultOptions(DEFAULT))
-    seen = found.verdict.indicators
-    assert math.isnan(seen.rank_correlation) and math.isnan(seen.prior_ratio) and not seen.on_edge
+    seen = found.verdict.facts
+    assert seen[PriorCorrelation] is seen[PriorScale] is seen[SearchEdge] is None
+    assert seen[MatchedFraction].confidence is None
     assert (
         found.over_prior
         is found.prior_error
@@ -214,20 +245,21 @@ def test_numbers_that_no_member_has_stay_unknown():
     )
     two = [member(0, rank_correlation=torch.tensor([math.nan])), member(1, on_edge=torch.tensor([False]))]
     two[0] = replace(two[0], prior_depth_m=None)
-    seen = finish(evidence_of(), two, merged(two), None, ResultOptions(DEFAULT)).verdict.indicators
-    assert seen.rank_correlation == pytest.approx(0.6) and math.isnan(seen.prior_ratio) and not seen.on_edge
+    seen = finish(evidence_of(), two, merged(two), None, ResultOptions(DEFAULT)).verdict.facts
+    assert seen[PriorCorrelation].rank_correlation == pytest.approx(0.6)
+    assert seen[PriorScale] is None and not seen[SearchEdge].on_edge
 
 
 def test_without_a_unit_the_priors_metres_do_not_judge():
     for has_unit in (True, False):
-        options = ResultOptions(DEFAULT, has_unit=has_unit)
+        options = ResultOptions(DEFAULT, call=Call(has_unit=has_unit))
         found = finish(evidence_of(), MEMBERS, merged(MEMBERS), None, options)
-        seen = found.verdict.indicators
-        assert math.isnan(seen.prior_ratio) is not has_unit and (seen.baseline_m > 0) is has_unit
+        seen = found.verdict.facts
+        assert (seen[PriorScale] is not None) is (seen[LengthUnits].baseline_m is not None) is has_unit
         assert found.over_prior is not None
 
 
-@pytest.mark.parametrize("config", [DEFAULT, DEFAULT.changed(crisp=False)])
+@pytest.mark.parametrize("config", [DEFAULT, DEFAULT.changed(refine_edges=False)])
 def test_without_matches_and_points_the_members_map_stays(config):
     """Clamped to what the members reach; no view sees anything, and nothing is judged."""
     evidence = evidence_of(views=False, matches=None)
@@ -238,7 +270,7 @@ def test_without_matches_and_points_the_members_map_stays(config):
         float(f([getattr(each, n) for each in MEMBERS])) for f, n in ((min, "near_m"), (max, "far_m"))
     )
     torch.testing.assert_close(found.depth_m, given.clamp(near, far))
-    assert (found.uncertainty == 0.3).all() and found.visible_share == 1.0
+    assert (found.uncertainty == 0.3).all() and found.verdict.facts[MatchedFraction] is None
     assert found.visible is found.photometric_error is found.confidence is found.support is None
     assert found.verdict.status == "not judged"
 
@@ -249,7 +281,7 @@ def test_without_matches_and_points_the_members_map_stays(config):
 def test_members_are_reduced_at_the_size_of_the_image_if_that_is_asked_for(reduction, even, resampling):
     """Of an even number, each within its own range; resized without antialiasing, as the stock call does."""
     members = [*MEMBERS, member(3)]
-    config = DEFAULT.changed(ensemble_at="image", even_ensemble=even, crisp=False)
+    config = DEFAULT.changed(ensemble_at="image", even_ensemble=even, refine_edges=False)
     options = ResultOptions(config, resampling=resampling, reduction=reduction)
     evidence, given = evidence_of(views=False, matches=None), torch.full((1, 1, 20, 60), 4.0)
     align = {} if resampling == "nearest" else {"align_corners": False}
@@ -281,24 +313,24 @@ def test_depth_ends_where_the_cameras_or_the_stated_range_do(reach_m, depth_rang
     config = DEFAULT.changed(depth_range=depth_range)
     volume = SimpleNamespace(reach_m=(0.5, reach_m), inverse_depth=torch.linspace(0.24, 0.3, 16))
     evidence = evidence_of(volume=volume)
-    found = finish(evidence, MEMBERS, merged(MEMBERS), None, ResultOptions(config))
+    call = Call(range_given=depth_range is not None)
+    found = finish(evidence, MEMBERS, merged(MEMBERS), None, ResultOptions(config, call=call))
     inverse = evidence.matches.inverse_depth[evidence.matches.confidence > 0.5]
     at_end = ((inverse - 0.24).abs() < 0.003) | ((inverse - 0.3).abs() < 0.003)
-    expected = 0.0 if depth_range is None else float(at_end.float().mean())
-    assert found.verdict.indicators.at_end == pytest.approx(expected) and at_end.any()
+    ends = found.verdict.facts[SearchRange]
+    assert at_end.any() and (ends is None) is (depth_range is None)
+    assert ends is None or ends.fraction == pytest.approx(float(at_end.float().mean()))
     assert float(found.depth_m.max()) == pytest.approx(farthest_m)
     assert torch.equal(found.confidence == 0, found.depth_m == found.depth_m.max())
-    assert found.verdict.indicators.range_given is (depth_range is not None)
 
 
 def rows_of(rng) -> RowMatches:
     """Rows on a grid of their own, with a few hidden strips."""
     size = (33, 48)
     shift = rng.uniform(1.0, 5.0, size)
-    hidden = rng.random(size) < 0.3
-    layers = [torch.from_numpy(np.asarray(x, np.float32)) for x in (shift, ~hidden, hidden, 0 * shift)]
-    checks = BackgroundTask.known(RowChecks(math.nan, math.nan))
-    return RowMatches(*layers, torch.tensor(0.25), checks)
+    occluded = rng.random(size) < 0.3
+    layers = [torch.from_numpy(np.asarray(x, np.float32)) for x in (shift, ~occluded, occluded, 0 * shift)]
+    return RowMatches(*layers, torch.tensor(0.25))
 
 
 @pytest.fixture
@@ -319,12 +351,12 @@ def stages(monkeypatch):
     )
     made = {
         "sharpen_edges": None,
-        "vote_depth": None,
+        "filter_depth": None,
         "flatten": None,
-        "correction_target": lambda *_: next(targets),
+        "fit_target": lambda *_: next(targets),
         "fit_depth": lambda *_: DepthFit(next(maps), next(maps), next(maps)),
-        "grounds_of": lambda *_: "grounds",
-        "with_hidden": lambda target, strips: replace(target, confidence=0.5 * target.confidence),
+        "features_of": lambda *_: "grounds",
+        "with_occluded": lambda target, strips: replace(target, confidence=0.5 * target.confidence),
     }
     for name, value in made.items():
         monkeypatch.setattr(module, name, stage(name, value))
@@ -334,13 +366,13 @@ def stages(monkeypatch):
 @pytest.mark.parametrize("has_rows", [True, False])
 def test_each_stage_works_on_what_the_stage_before_it_made(stages, has_rows):
     rows = rows_of(np.random.default_rng(7)) if has_rows else None
-    evidence = evidence_of(points=points_of(), rows=None if rows is None else BackgroundTask.known(rows))
+    evidence = evidence_of(points=points_of(), rows=rows)
     left, denoised = torch.rand(1, 3, *OUTPUT), merged(MEMBERS)
     found = refine(evidence, MEMBERS, denoised, left, DEFAULT)
     ((sharpening, sharp),) = stages["sharpen_edges"]
     assert sharpening[0] is denoised and sharpening[1] is left and sharpening[2] == 2  # 60 px of 32
-    (first, target), (second, last_target) = stages["correction_target"]
-    weights = torch.cat([each.reflection_weight for each in MEMBERS]).mean(0, keepdim=True)
+    (first, target), (second, last_target) = stages["fit_target"]
+    weights = torch.cat([each.match_weight for each in MEMBERS]).mean(0, keepdim=True)
     error = torch.stack([each.error for each in MEMBERS]).mean(0)
     valid = torch.cat([each.valid for each in MEMBERS]).any(0)[None]
     local = torch.where(valid, error, 0.5)
@@ -351,14 +383,14 @@ def test_each_stage_works_on_what_the_stage_before_it_made(stages, has_rows):
         torch.testing.assert_close(given[2], weights)
         torch.testing.assert_close(given[3], local)
         assert given[4] is depth
-    hidden = stages.get("with_hidden", [])
-    assert [each[0][0] for each in hidden] == ([target, last_target] if has_rows else [])
-    completed = [each[1] for each in hidden] or [target, last_target]
+    occluded = stages.get("with_occluded", [])
+    assert [each[0][0] for each in occluded] == ([target, last_target] if has_rows else [])
+    completed = [each[1] for each in occluded] or [target, last_target]
     assert fitting[0] is sharp and fitting[1] is completed[0] and fitting[4] is DEFAULT
-    assert torch.equal(fitting[2][0], evidence.native.left_01)
+    assert torch.equal(fitting[2][0], evidence.native.left.image_01)
     torch.testing.assert_close(fitting[3], local)
-    ((voting, voted),) = stages["vote_depth"]
-    known = known_share(completed[1])
+    ((voting, voted),) = stages["filter_depth"]
+    known = known_fraction(completed[1])
     assert voting[0] is fit.depth_m and voting[1] is evidence and voting[2] is completed[1]
     torch.testing.assert_close(voting[3], known)
     torch.testing.assert_close(voting[4], error)
@@ -367,30 +399,30 @@ def test_each_stage_works_on_what_the_stage_before_it_made(stages, has_rows):
     assert flattening[0] is voted and flattening[1] is completed[1] and flattening[2] is left
     torch.testing.assert_close(flattening[3], error)
     assert flattening[4] is denoised
-    (((*grounds, support), _),) = stages["grounds_of"]
-    assert grounds[0] is denoised and grounds[1] is flat and grounds[2] is last_target
-    assert support is fit.support and found.depth_m is flat and found.grounds == "grounds"
-    torch.testing.assert_close(found.support, fit.support * determined(known, OUTPUT))
+    (((*features, support), _),) = stages["features_of"]
+    assert features[0] is denoised and features[1] is flat and features[2] is last_target
+    assert support is fit.support and found.depth_m is flat and found.features == "grounds"
+    torch.testing.assert_close(found.support, fit.support * data_support(known, OUTPUT))
     if has_rows:
-        strips = hidden[0][0][1]
+        strips = occluded[0][0][1]
         inverse = rows.shift / (60.0 * 48 / 64 * 0.25)
         torch.testing.assert_close(
             strips.inverse_depth, F.interpolate(inverse[None, None], GRID, mode="nearest-exact")
         )
-        inside = F.interpolate(rows.hidden[None, None], GRID, mode="nearest-exact") > 0
+        inside = F.interpolate(rows.occluded[None, None], GRID, mode="nearest-exact") > 0
         assert torch.equal(strips.inside, inside)
 
 
 def test_points_alone_are_fitted_to_and_nothing_is_voted_on(stages):
-    rows = BackgroundTask.known(rows_of(np.random.default_rng(7)))
+    rows = rows_of(np.random.default_rng(7))
     evidence = evidence_of(matches=None, points=points_of(), rows=rows)
     found = refine(evidence, MEMBERS, merged(MEMBERS), torch.rand(1, 3, *OUTPUT), DEFAULT)
-    assert stages.keys() == {"sharpen_edges", "correction_target", "fit_depth", "grounds_of"}
-    ((given, target),) = stages["correction_target"]
+    assert stages.keys() == {"sharpen_edges", "fit_target", "fit_depth", "features_of"}
+    ((given, target),) = stages["fit_target"]
     assert given[0] is None
     ((_, fit),) = stages["fit_depth"]
     assert found.depth_m is fit.depth_m and found.support is fit.support
-    assert stages["grounds_of"][0][0][2] is target
+    assert stages["features_of"][0][0][2] is target
     assert (
         refine(evidence_of(matches=None), MEMBERS, merged(MEMBERS), torch.rand(1, 3, *OUTPUT), DEFAULT)
         is None
@@ -413,28 +445,123 @@ def test_a_run_without_matches_is_judged_by_matches_made_for_that(monkeypatch, h
 
     monkeypatch.setattr(module, "build_cost_volume", build)
     monkeypatch.setattr(module, "match_volume", lambda of: asked.update(volume=of) or whole.matches)
-    config = DEFAULT.changed(depth_range=(0.8, 90.0), crisp=False)
-    evidence = replace(whole, volume=volume, matches=None, points=points_of())
+    config = DEFAULT.changed(depth_range=(0.8, 90.0), refine_edges=False)
+    evidence = replace(whole, volume=volume, matches=None, points=points_of(), points_outside=3)
     found = finish(evidence, MEMBERS, merged(MEMBERS), None, ResultOptions(config))
-    seen = found.verdict.indicators
+    seen = found.verdict.facts
     assert asked["volume"] is (volume or made)
     if not has_volume:
         assert asked["native"] is evidence.native
         assert asked["depth_range"] == (0.8, 90.0) and asked["config"] is config
     relative = np.median(torch.cat([each.relative for each in MEMBERS]).numpy(), 0)[None]
     correlation = order_agreement(torch.from_numpy(relative), whole.matches, "depth")
-    assert seen.rank_correlation == pytest.approx(float(correlation)) and seen.rank_correlation > 0.8
-    assert seen.matched == pytest.approx(float((whole.matches.confidence > 0.5).float().mean()))
-    assert seen.points == 0 and found.evidence is evidence
+    measured = seen[PriorCorrelation].rank_correlation
+    assert measured == pytest.approx(float(correlation)) and measured > 0.8
+    matched = float((whole.matches.confidence > 0.5).float().mean())
+    assert seen[MatchedFraction].matched == pytest.approx(matched)
+    assert seen[KnownPoints].count == 0 and found.evidence is evidence
+    assert [finding.code for finding in found.verdict.findings] == ["points.outside"]
 
 
 def test_views_that_do_not_overlap_are_not_judged(monkeypatch):
-    def refuse(*_, **__):
+    def raise_input_error(*_, **__):
         raise InputError("the views do not overlap")
 
-    monkeypatch.setattr(module, "build_cost_volume", refuse)
+    monkeypatch.setattr(module, "build_cost_volume", raise_input_error)
     evidence = replace(evidence_of(), volume=None, matches=None, points=points_of())
-    found = finish(evidence, MEMBERS, merged(MEMBERS), None, ResultOptions(DEFAULT.changed(crisp=False)))
-    seen = found.verdict.indicators
-    assert math.isnan(seen.matched) and seen.rank_correlation == pytest.approx(0.6)
-    assert seen.points == int((points_of().confidence > 0).sum()) == 90
+    found = finish(
+        evidence, MEMBERS, merged(MEMBERS), None, ResultOptions(DEFAULT.changed(refine_edges=False))
+    )
+    seen = found.verdict.facts
+    assert not MatchedFraction.has_matches(seen)
+    assert seen[PriorCorrelation].rank_correlation == pytest.approx(0.6)
+    assert seen[KnownPoints].count == int((points_of().confidence > 0).sum()) == 90
+
+
+FAST = {"guidance_steps": 1, "min_steps": 1}
+
+
+def knowing(kind, depth_m, factor=1.0):
+    """A model that returns ground truth, in its own unit, times a factor; for a prompt, the prompt."""
+    pipe, answer = make_transformers(kind), torch.from_numpy(depth_m)[None] * factor
+
+    def forward(pixel_values, prompt_depth=None):
+        values, fov = answer, {}
+        if kind == "depth_pro":
+            values, fov = 1 / answer, {"field_of_view": torch.tensor([2 * np.degrees(np.arctan(0.5))])}
+        elif prompt_depth is not None:
+            values = torch.nn.functional.interpolate(prompt_depth, answer.shape[1:], mode="bilinear")[:, 0]
+        return type("Output", (), {"predicted_depth": values, **fov})()
+
+    pipe.model.forward = forward
+    return enable_geometry_guidance(pipe)
+
+
+def guided(pipe, pair, **parameters):
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, **FAST | parameters)
+    return pipe(Image.fromarray(pair.left), guidance=guidance, processing_resolution=64)
+
+
+@END_TO_END
+@pytest.mark.parametrize("kind", ["zoedepth", "glpn", "tipsv2", "depth_pro"])
+def test_a_run_reports_the_deviation_of_the_priors_metres(kind, textured_plane):
+    out = guided(knowing(kind, textured_plane.depth_m, factor=0.5), textured_plane)
+    assert out.prior_scale.shape == (1, 1) and float(out.prior_scale) == pytest.approx(2.0, rel=0.02)
+    assert any("2 times the metric prior's depth" in sentence for sentence in out.findings)
+    assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
+
+
+@END_TO_END
+def test_prompt_depth_anything_is_given_what_is_known_unless_it_is_given_depths(textured_plane):
+    pipe = knowing("prompt_depth_anything", textured_plane.depth_m)
+    out = guided(pipe, textured_plane)
+    assert float(out.prior_scale) == pytest.approx(1.0, abs=0.01)  # its map is in metres with a prompt
+    call = {"image": Image.fromarray(textured_plane.left), "processing_resolution": 64}
+    pipe(**call)
+    assert pipe.metric_range is None  # without guidance it is a relative prior
+    own = torch.linspace(7.0, 9.0, 24).view(1, 1, 4, 6)
+    pipe(**call, prompt_depth=own)
+    assert pipe.metric_range[0].tolist() == pytest.approx([7.0, 9.0], abs=0.1)
+    with pytest.raises(ValueError, match="prompt_depth"):
+        make_transformers("zoedepth")(**call, prompt_depth=own)
+
+
+@END_TO_END
+def test_without_a_length_the_metres_are_those_of_a_metric_prior():
+    """An estimated pose has no unit; the prior knows the depth in metres, so everything is in metres."""
+    pytest.importorskip("poselib")
+    pair = render_pair(0, posed=True)  # 8 degrees of parallax, so that the estimated pose is accurate
+    depth_m, E = pair.left.depth_m[0].numpy(), pair.E.numpy()
+    left, right = (
+        np.rint(v.image_01.permute(1, 2, 0).numpy() * 255).astype(np.uint8) for v in (pair.left, pair.right)
+    )
+    runs = {}
+    for kind in ("zoedepth", "depth_anything"):
+        guidance = GeometryGuidance.from_unposed_images(left, right, K=pair.K_left.numpy(), **FAST)
+        call = {"guidance": guidance, "processing_resolution": 64}
+        runs[kind] = knowing(kind, depth_m)(Image.fromarray(left), **call)
+    metric, relative = runs["zoedepth"], runs["depth_anything"]
+    baseline = float(np.linalg.norm(E[:3, 3]))
+    assert metric.unit == "m" and metric.scale_from == "prior" and 0 < metric.scale_rel_std < 0.1
+    assert metric.rescaled == pytest.approx(baseline, rel=0.03)
+    assert np.median(metric.prediction[0, ..., 0] / depth_m) == pytest.approx(1.0, rel=0.025)
+    assert np.linalg.norm(metric.poses[0].E[0][:3, 3]) == pytest.approx(metric.rescaled, rel=1e-5)
+    assert float(metric.prior_scale) == pytest.approx(1.0, rel=1e-5)
+    assert any("scale is the metric prior's" in sentence for sentence in metric.findings)
+    assert not any("no unit" in sentence for sentence in metric.findings)
+    assert relative.unit is None and relative.scale_from == "none" and relative.rescaled == 1.0
+    assert any("no unit" in sentence for sentence in relative.findings)
+
+
+@END_TO_END
+def test_given_poses_without_a_unit_get_the_metres_of_a_metric_prior(textured_plane):
+    scaled = textured_plane.E.copy()
+    scaled[:3, 3] *= 0.001 / np.linalg.norm(scaled[:3, 3])  # as a model of COLMAP might have it
+    pair = replace(textured_plane, E=scaled)
+    metric, relative = (
+        guided(knowing(kind, pair.depth_m), pair, unit=None) for kind in ("zoedepth", "depth_anything")
+    )
+    assert metric.unit == "m" and metric.scale_from == "prior"
+    assert np.median(metric.prediction[0, ..., 0] / pair.depth_m) == pytest.approx(1.0, rel=0.03)
+    assert sum("scale is the metric prior's" in sentence for sentence in metric.findings) == 1
+    assert relative.unit is None and not any(" mm" in sentence for sentence in relative.findings)

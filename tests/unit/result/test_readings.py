@@ -1,4 +1,4 @@
-"""What a map says at its pixels, against plane geometry and drawn errors."""
+"""Readings of a map, against plane geometry and drawn errors."""
 
 import math
 from dataclasses import FrozenInstanceError
@@ -34,7 +34,7 @@ def test_pixels_outside_are_named_with_the_size_of_the_map(pixel):
 def test_a_pixel_without_a_depth_is_named(value):
     depth = DEPTH.copy()
     depth[7, 5] = value
-    with pytest.raises(ValueError, match="one with a depth"):
+    with pytest.raises(ValueError, match="a pixel with a depth"):
         read_pixel(depth, K, (5, 7))
     assert read_pixel(depth, K, (7, 5)).depth_m == DEPTH[5, 7]
 
@@ -44,22 +44,23 @@ def test_a_pixel_without_a_depth_is_named(value):
     [(0.0, 0.05), (0.04, 0.05), (0.06, 0.06), (0.5, 0.5), (0.99, 0.99), (1.0, 0.999)],
 )
 def test_the_spread_of_a_normal_error_that_is_within_a_tenth_with_this_confidence(confidence, counted):
-    sure, off = np.full_like(DEPTH, 0.3), np.full_like(DEPTH, 7.0)
-    sure[7, 5], off[7, 5] = confidence, 1e-6
-    at = read_pixel(DEPTH, K, (5, 7), sure, off)
+    sure = np.full_like(DEPTH, 0.3)
+    sure[7, 5] = confidence
+    at = read_pixel(DEPTH, K, (5, 7), sure)
     within = norm.cdf(0.1 / at.spread) - norm.cdf(-0.1 / at.spread)
     assert within == pytest.approx(counted) and at.confidence == confidence
     assert at.spread_m == pytest.approx(at.spread * DEPTH[7, 5])
 
 
-def test_the_larger_of_both_spreads_counts_and_the_deviation_of_members_alone():
-    sure, off = np.full_like(DEPTH, 0.9), np.full_like(DEPTH, 0.2)
-    expected = 1.4826 * 0.2 / DEPTH[3, 9]
-    assert read_pixel(DEPTH, K, (9, 3), None, off).spread == pytest.approx(expected)
-    by_confidence = read_pixel(DEPTH, K, (9, 3), sure).spread
-    for factor in (0.01, 100.0):
-        found = read_pixel(DEPTH, K, (9, 3), sure, factor * off).spread
-        assert found == pytest.approx(max(by_confidence, factor * expected))
+def test_a_given_sigma_counts_instead_of_the_confidence_and_may_be_unknown():
+    sure, sigma_m = np.full_like(DEPTH, 0.9), np.full_like(DEPTH, np.nan)
+    sigma_m[3, 9] = 0.2
+    for confidence in (sure, None):
+        at = read_pixel(DEPTH, K, (9, 3), confidence, sigma_m)
+        assert at.spread == pytest.approx(0.2 / DEPTH[3, 9]) and at.spread_m == pytest.approx(0.2)
+        assert at.confidence == (None if confidence is None else 0.9)
+    unknown = read_pixel(DEPTH, K, (8, 3), sure, sigma_m)
+    assert unknown.spread is None and unknown.spread_m is None and unknown.confidence == 0.9
 
 
 def reading(point, spread) -> Reading:
@@ -78,7 +79,7 @@ def test_a_distance_is_as_uncertain_as_drawn_points_along_their_rays():
         assert distance_m(*unknown) == (pytest.approx(length), None)
 
 
-def test_two_readings_of_one_point_are_apart_by_their_own_errors():
+def test_two_readings_of_one_point_differ_by_their_own_errors():
     point = (0.6, 0.0, 0.8)
     assert distance_m(reading(point, 0.3), reading(point, 0.4)) == (0.0, pytest.approx(0.5))
     assert distance_m(reading(2 * np.array(point), 0.3), reading(2 * np.array(point), 0.4))[

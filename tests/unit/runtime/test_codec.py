@@ -83,7 +83,7 @@ def test_each_published_tiny_autoencoder_is_found_by_latent_and_scaling_factor(
     for other in (pipe(channels=8), pipe(stages=(8,) * 3), pipe(factor=0.9)):
         with pytest.raises(
             ValueError,
-            match=r"decoder must be 'full' with .*; got 'tiny'\. None is published for its latent of",
+            match=r"decoder must be 'full' with .*; got 'tiny'\. No tiny autoencoder is published for",
         ):
             tiny_autoencoder(other, "tiny")
     # One that the user names must be of the same latent.
@@ -96,7 +96,7 @@ def test_each_published_tiny_autoencoder_is_found_by_latent_and_scaling_factor(
     for without in (SimpleNamespace(), SimpleNamespace(vae=SimpleNamespace(config={"z_dim": 16}))):
         with pytest.raises(
             ValueError,
-            match=r"'full' with SimpleNamespace; got 'me/mine'\. It has no latent of a single image",
+            match=r"'full' with SimpleNamespace; got 'me/mine'\. This prior has no single-image latent",
         ):
             tiny_autoencoder(without, "me/mine")
     assert len(PUBLISHED) == 4
@@ -118,7 +118,7 @@ def test_a_name_is_a_folder_or_a_hub_id_and_what_it_names_is_frozen(monkeypatch,
     assert asked == [("owner/name", of_half), (str(tmp_path), of_half)]
     for name in ("name", "a/b/c", "./b", "/b", "~/b"):
         with pytest.raises(
-            ValueError, match=f"decoder must be .*a folder that is there, or a hub id; got '{name}'"
+            ValueError, match=f"decoder must be .*an existing folder, or a hub id; got '{name}'"
         ):
             codec._loaded(name, torch.float16, "cpu")
     codec._loaded.cache_clear()
@@ -192,20 +192,20 @@ def test_the_clean_latent_is_moved_and_noise_and_other_channels_stay(dtype):
     torch.testing.assert_close(estimate.eps, 0.6 * of_depth[0] + 0.8 * of_depth[1])
     assert torch.equal(estimate.output, of_depth[0]) and estimate.latent.dtype == wide
     assert estimate.z0(estimate.latent) is estimate.latent
-    move = 0.1 * drawn(2, 2, 3, 4, seed=5).to(wide)
-    inputs = estimate.step_inputs(move, from_moved=False)
-    assert inputs.move is None and inputs.output.dtype == inputs.z_t.dtype == dtype
+    offset = 0.1 * drawn(2, 2, 3, 4, seed=5).to(wide)
+    inputs = estimate.step_inputs(offset, from_updated=False)
+    assert inputs.offset is None and inputs.output.dtype == inputs.z_t.dtype == dtype
     for found, given in ((inputs.output, output), (inputs.z_t, z_t)):
         assert torch.equal(found[:, [0, 3, 4]], given[:, [0, 3, 4]])
     depth = inputs.output[:, 1:3].to(wide), inputs.z_t[:, 1:3].to(wide)
     near = {"atol": 5e-3 if dtype == torch.float16 else 1e-5, "rtol": 0}
-    torch.testing.assert_close(z0_from(*depth, LEVEL), estimate.latent + move, **near)
+    torch.testing.assert_close(z0_from(*depth, LEVEL), estimate.latent + offset, **near)
     torch.testing.assert_close(noise_from(*depth, LEVEL), estimate.eps, **near)
 
 
-@pytest.mark.parametrize("from_moved", [True, False])
+@pytest.mark.parametrize("from_updated", [True, False])
 @pytest.mark.parametrize("max_steps", [None, 1, 4])
-def test_the_noisy_latent_is_moved_before_or_after_the_step(from_moved, max_steps):
+def test_the_noisy_latent_is_moved_before_or_after_the_step(from_updated, max_steps):
     """A prior of one step is asked again: its step returns the clean latent of the moved one."""
     made, output, z_t = a_codec(), drawn(2, 5, 3, 4, seed=3), drawn(2, 5, 3, 4, seed=4)
     made.prior.max_steps = max_steps
@@ -214,17 +214,17 @@ def test_the_noisy_latent_is_moved_before_or_after_the_step(from_moved, max_step
     assert estimate.latent is tap.leaf
     moved = estimate.latent + 0.3
     torch.testing.assert_close(estimate.z0(moved), 0.6 * moved - 0.8 * (2.0 * moved + 1.0))
-    move = drawn(2, 2, 3, 4, seed=5)
-    inputs = estimate.step_inputs(move, from_moved)
+    offset = drawn(2, 2, 3, 4, seed=5)
+    inputs = estimate.step_inputs(offset, from_updated)
     assert not any(each is not None and each.requires_grad for each in inputs)
     there = z_t.clone()
-    there[:, 1:3] += move
-    if max_steps == 1 or from_moved:
+    there[:, 1:3] += offset
+    if max_steps == 1 or from_updated:
         torch.testing.assert_close(inputs.z_t, there)
-        assert inputs.move is None
+        assert inputs.offset is None
     else:
         assert inputs.z_t is z_t
-        torch.testing.assert_close(z_t + inputs.move, there)
+        torch.testing.assert_close(z_t + inputs.offset, there)
     if max_steps == 1:
         torch.testing.assert_close(inputs.output, tap.output_at(there[:, 1:3]))
     else:

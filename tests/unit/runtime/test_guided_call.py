@@ -1,4 +1,4 @@
-"""Arguments of a guided call, what is refused, and how a batch with ensembles is put together."""
+"""Arguments of a guided call, what is rejected, and how a batch with ensembles is put together."""
 
 import warnings
 from types import SimpleNamespace
@@ -9,7 +9,13 @@ import torch
 from diffusers import MarigoldDepthPipeline
 from torch import nn
 
-from geodiff_plugin import GeometryGuidance, disable_geometry_guidance, enable_geometry_guidance
+from geodiff_plugin import (
+    GeometryGuidance,
+    disable_geometry_guidance,
+    enable_geometry_guidance,
+)
+from geodiff_plugin._internal import threads as _threads
+from geodiff_plugin._internal.threads import BackgroundTask
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime import guided_call
 from geodiff_plugin.runtime.guided_call import (
@@ -20,6 +26,7 @@ from geodiff_plugin.runtime.guided_call import (
     _check_guidable,
     _check_guided_call,
     _check_weights_stay,
+    _close,
     _guided_class,
     _one_member,
     _stock_class,
@@ -75,14 +82,14 @@ def test_what_a_pipeline_takes_is_accepted(changes):
         ({"ensemble_size": 0}, "ensemble_size must be between 1"),
         (
             {"generator": [torch.Generator()] * 5},
-            "a list of 6: one for every image and member; got a list of 5",
+            "a list of 6, one per image and ensemble member; got a list of 5",
         ),
         ({"generator": [torch.Generator()] * 5 + [3]}, "generator must be None"),
         ({"generator": 3}, "generator must be None, a torch.Generator or a list of them; got int"),
         ({"latents": torch.tensor([0.0, torch.inf])}, "latents must be finite; got NaN or infinity in it"),
     ],
 )
-def test_what_no_pipeline_takes_is_refused(changes, message):
+def test_what_no_pipeline_takes_is_rejected(changes, message):
     with pytest.raises((ValueError, TypeError), match=message):
         _check_arguments(CALL | changes, 2)
 
@@ -90,9 +97,9 @@ def test_what_no_pipeline_takes_is_refused(changes, message):
 def test_a_prior_that_always_gives_the_same_map_runs_the_first_member_of_every_image():
     generators, latents = [object() for _ in range(6)], torch.arange(6.0).view(6, 1, 1, 1)
     call = {"ensemble_size": 3, "generator": generators, "latents": latents, "output_uncertainty": True}
-    with pytest.warns(match="only one member runs") as told:
+    with pytest.warns(match="only one ensemble member runs") as reported:
         changed = _one_member(call)
-    assert told[0].message.args[0].code == "prior.one-member"
+    assert reported[0].message.args[0].code == "prior.one-member"
     assert changed.pop("generator") == [generators[0], generators[3]]
     assert changed.pop("latents").flatten().tolist() == [0.0, 3.0]
     assert changed == {"ensemble_size": 1, "output_uncertainty": False}
@@ -106,9 +113,9 @@ def test_the_warning_about_members_points_at_the_call(monkeypatch):
     monkeypatch.setattr(guided_call, "compile_kernels", lambda *_: 1 / 0)
     pipe, pair = enable_geometry_guidance(make_e2e_ft()), plane_pair()
     guidance = GeometryGuidance(pair.right, pair.K, pair.E)
-    with pytest.warns(match="only one member runs") as told, pytest.raises(ZeroDivisionError):
+    with pytest.warns(match="only one ensemble member runs") as reported, pytest.raises(ZeroDivisionError):
         pipe(pair.left, guidance=guidance, ensemble_size=2)
-    assert [each.filename for each in told] == [__file__]
+    assert [each.filename for each in reported] == [__file__]
     with pytest.raises(ZeroDivisionError):  # one member needs no warning
         pipe(pair.left, guidance=guidance)
 
@@ -142,13 +149,14 @@ def hooked(layer_hooks=(), accelerate=None) -> nn.Module:
         (hooked(["other"]), True, None),
     ],
 )
-def test_weights_that_leave_or_are_cast_before_a_backward_pass_are_refused(layer, differentiated, refused):
+def test_weights_that_leave_or_are_cast_before_a_backward_pass_are_rejected(layer, differentiated, refused):
     if refused is None:
         _check_weights_stay("UNet", layer, differentiated)
         return
     with pytest.raises(
         ValueError,
-        match=rf"pipe must be without .*{refused}.*; got UNet whose weights .*\. (The back|Leave inner)",
+        match=rf"pipe must be without .*{refused}.*; got UNet, whose weights .*\. "
+        "(The back|Set guidance_steps)",
     ):
         _check_weights_stay("UNet", layer, differentiated)
 
@@ -163,7 +171,7 @@ def test_weights_that_leave_or_are_cast_before_a_backward_pass_are_refused(layer
         ("unet", "full", False, False),
     ],
 )
-def test_casting_is_refused_where_gradients_go_through(hooked_part, gradient, moves, refused):
+def test_casting_is_rejected_where_gradients_go_through(hooked_part, gradient, moves, refused):
     pipe = make_marigold()
     getattr(pipe, hooked_part)._diffusers_hook = SimpleNamespace(hooks={"layerwise_casting": 1})
     guidance = SimpleNamespace(
@@ -187,14 +195,14 @@ def test_a_gradient_through_the_network_needs_its_input_and_its_weights_on_the_d
     )
     layers = Layers.of(pipe)
     with pytest.raises(
-        ValueError, match=r"gradient must be 'denoised' with this prior; got 'full'\. z_t is no input"
+        ValueError, match=r"gradient must be 'denoised' with this prior; got 'full'\. z_t is not an input"
     ):
         _check_guidable(pipe, none, guidance, layers)
     guidance.through_network = False
     _check_guidable(pipe, none, guidance, layers)
     pipe._all_hooks = [object()]
     with pytest.raises(
-        ValueError, match=r"gradient must be .*enable_model_cpu_offload\(\); got 'full'\. Decoding pushes"
+        ValueError, match=r"gradient must be .*enable_model_cpu_offload\(\); got 'full'\. Decoding moves"
     ):
         _check_guidable(pipe, none, guidance, layers)
     guidance.config.gradient = "denoised"
@@ -211,10 +219,10 @@ def test_the_steps_of_a_call_are_the_users_or_enough_for_the_guidance(monkeypatc
 
 
 def test_only_guidance_functions_and_updates_with_gradients_are_taken():
-    with pytest.raises(TypeError, match=r"guidance must be a GeometryGuidance; got object\. Make one"):
+    with pytest.raises(TypeError, match=r"guidance must be a GeometryGuidance; got object\. Create one"):
         _check_guided_call(object(), None)
     pair = plane_pair()
-    with_updates, without = (GeometryGuidance(pair.right, pair.K, pair.E, inner_steps=n) for n in (1, 0))
+    with_updates, without = (GeometryGuidance(pair.right, pair.K, pair.E, guidance_steps=n) for n in (1, 0))
     with pytest.raises(TypeError, match="callback_on_step_end must be a function; got int"):
         _check_guided_call(without, 3)
     _check_guided_call(with_updates, print)
@@ -237,7 +245,7 @@ def test_classes_of_guided_pipelines_are_made_once_and_undone():
     assert disable_geometry_guidance(pipe) is pipe and type(pipe) is MarigoldDepthPipeline
     enable_geometry_guidance(pipe, kernels=False)
     assert type(pipe) is GuidedMarigoldDepthPipeline and pipe._faster is None and not pipe._uses_kernels
-    enable_geometry_guidance(pipe, kernels=True, graphs=True)
+    enable_geometry_guidance(pipe, kernels=True, cuda_graphs=True)
     assert pipe._faster is not None and pipe._uses_kernels
     kept = pipe._faster
     assert enable_geometry_guidance(pipe)._faster is kept
@@ -260,8 +268,8 @@ class Stock:
     def ensemble_depth(self, *arguments, **options):
         return ("ensemble_depth", arguments, options)
 
-    def put_together(self, *arguments, **options):
-        return ("put_together", arguments, options)
+    def combine_members(self, *arguments, **options):
+        return ("combine_members", arguments, options)
 
 
 class Guided(GuidedCall, Stock):
@@ -273,7 +281,7 @@ def test_methods_of_the_pipeline_are_the_stock_ones_outside_of_guided_calls(monk
     assert pipe.progress_bar([1], 3, a=1) == ("progress_bar", ([1], 3), {"a": 1})
     assert pipe.decode_prediction("z") == ("decode_prediction", ("z",), {})
     assert pipe.ensemble_depth("d", True, reduction="mean")[1:] == (("d", True), {"reduction": "mean"})
-    assert pipe.put_together("m", 2, x=3) == ("put_together", ("m", 2), {"x": 3})
+    assert pipe.combine_members("m", 2, x=3) == ("combine_members", ("m", 2), {"x": 3})
     config = SimpleNamespace(even_ensemble="mean")
     pipe._guided_run = SimpleNamespace(
         metric_prediction=lambda z: ("metres", z), config=config, device="here"
@@ -291,8 +299,8 @@ def test_methods_of_the_pipeline_are_the_stock_ones_outside_of_guided_calls(monk
         options = {} if reduction == "median" else {"reduction": reduction}
         depth_m, spread = pipe.ensemble_depth(depths, True, **options)
         assert depth_m.shape == (1, 1, 2, 2) and (depth_m == expected).all() and spread is not None
-    monkeypatch.setattr(DepthDiffusionPipeline, "put_together", lambda self, *args, **kw: (self, args, kw))
-    assert pipe.put_together("m", 2, x=3) == (pipe, ("m", 2), {"x": 3})
+    monkeypatch.setattr(DepthDiffusionPipeline, "combine_members", lambda self, *args, **kw: (self, args, kw))
+    assert pipe.combine_members("m", 2, x=3) == (pipe, ("m", 2), {"x": 3})
 
 
 def test_the_processing_grid_is_that_of_the_stock_preprocessing(monkeypatch):
@@ -300,11 +308,11 @@ def test_the_processing_grid_is_that_of_the_stock_preprocessing(monkeypatch):
     pipe, asked = enable_geometry_guidance(make_marigold()), []
     stock = pipe.image_processor.preprocess
 
-    def noted(image, resolution, method, device):
+    def captured_warnings(image, resolution, method, device):
         asked.append((resolution, method, image.is_contiguous(memory_format=torch.channels_last)))
         return stock(image, resolution, method, device)
 
-    monkeypatch.setattr(pipe.image_processor, "preprocess", noted)
+    monkeypatch.setattr(pipe.image_processor, "preprocess", captured_warnings)
     image = torch.rand(2, 3, 45, 83)
     call = {"image": image, "latents": None, "processing_resolution": None, "resample_method_input": "area"}
     cpu = torch.device("cpu")
@@ -327,12 +335,28 @@ def views(count: int):
     ]
 
 
-KNOBS = {"min_steps": 1, "planes": 40, "inner_steps": 1, "pose": "given", "crisp": False}
+def test_at_its_end_a_call_waits_for_the_work_of_every_plan_and_leaves_a_failure_to_who_asks(monkeypatch):
+    closed = []
+    plans = [SimpleNamespace(close=lambda i=i: closed.append(i)) for i in range(3)]
+    _close(BackgroundTask.known(plans))
+    assert closed == [0, 1, 2]
+
+    def fails() -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(_threads, "leaves_cpu_free", lambda device: True)
+    failed = BackgroundTask(fails, torch.device("cpu"))
+    _close(failed)
+    with pytest.raises(ZeroDivisionError):
+        failed.result()
+
+
+PARAMETERS = {"min_steps": 1, "planes": 40, "guidance_steps": 1, "pose": "given", "refine_edges": False}
 
 
 def test_a_batch_with_ensembles_gives_each_image_what_it_gets_alone(monkeypatch):
     """Two images of two members in chunks of three samples: values of one image never reach the other."""
-    monkeypatch.setattr("geodiff_plugin.scale.points.BASIN_SAMPLES", 80)  # the slowest stage by far
+    monkeypatch.setattr("geodiff_plugin.scale.sampling.BASIN_SAMPLES", 80)  # the slowest stage by far
     pipe, pairs = enable_geometry_guidance(make_marigold()), views(2)
     call = {"ensemble_size": 2, "output_uncertainty": True, "output_latent": True, "output_type": "pt"}
     call["processing_resolution"] = 0
@@ -340,10 +364,10 @@ def test_a_batch_with_ensembles_gives_each_image_what_it_gets_alone(monkeypatch)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         both = GeometryGuidance(
-            [pair.right for pair in pairs], pairs[0].K, [pair.E for pair in pairs], **KNOBS
+            [pair.right for pair in pairs], pairs[0].K, [pair.E for pair in pairs], **PARAMETERS
         )
         together = pipe([pair.left for pair in pairs], guidance=both, latents=noise, batch_size=3, **call)
-        second = GeometryGuidance(pairs[1].right, pairs[1].K, pairs[1].E, **KNOBS)
+        second = GeometryGuidance(pairs[1].right, pairs[1].K, pairs[1].E, **PARAMETERS)
         alone = pipe(pairs[1].left, guidance=second, latents=noise[2:], batch_size=1, **call)
     maps = ("prediction", "uncertainty", "relative", "photometric_error")
     for name in (*maps, "scale", "shift", "global_scale", "prior_error", "K"):
@@ -365,26 +389,24 @@ def test_a_batch_with_ensembles_gives_each_image_what_it_gets_alone(monkeypatch)
 
 def test_the_output_is_as_asked_and_an_untrusted_depth_an_error_if_strict():
     pipe, (pair,) = enable_geometry_guidance(make_marigold()), views(1)
-    knobs = KNOBS | {"inner_steps": 0}
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, **knobs)
-    turned = GeometryGuidance(pair.right, pair.K, np.linalg.inv(pair.E), **knobs)
+    parameters = PARAMETERS | {"guidance_steps": 0}
+    guidance = GeometryGuidance(pair.right, pair.K, pair.E, **parameters)
+    turned = GeometryGuidance(pair.right, pair.K, np.linalg.inv(pair.E), **parameters)
     for name, given in (
         ("strict", {"strict": True}),
         ("callback_on_step_end", {"callback_on_step_end": print}),
     ):
-        with pytest.raises(
-            ValueError, match=f"^{name} must be given together with guidance; got guidance=None"
-        ):
+        with pytest.raises(ValueError, match=f"^{name} must be given only with guidance; got guidance=None"):
             pipe(pair.left, **given)
     call = {"generator": seeded(), "num_inference_steps": 1, "processing_resolution": 0}
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as reported:
         out = pipe(pair.left, guidance=turned, **call)
-    (place,) = [each.filename for each in told if each.message.args[0].code == "verdict.not-trusted"]
+    (place,) = [each.filename for each in reported if each.message.args[0].code == "verdict.not-trusted"]
     assert place == __file__  # the warning points at the call
     assert not out.verdict.trusted and out.latent is None
     with pytest.raises(ValueError) as refused:
         pipe(pair.left, guidance=turned, strict=True, **call)
-    assert str(refused.value).startswith(out.verdict.sentence[:40])
+    assert str(refused.value).startswith(out.verdict.summary[:40])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         parts = pipe(pair.left, guidance=guidance, return_dict=False, output_latent=True, **call)

@@ -11,10 +11,10 @@ from torch import nn
 
 from geodiff_plugin.runtime import hooks
 from geodiff_plugin.runtime.hooks import (
-    DenoiserTap,
-    Exclusive,
+    DenoiserHook,
     GuidedScheduler,
     Layers,
+    PipelineLock,
     frozen_weights,
     images_in_float32,
     put_channels,
@@ -109,7 +109,7 @@ class OtherThread:
         self._thread.start()
 
     def _take(self, owner: Pipe, guided: bool) -> None:
-        with Exclusive(owner, guided):
+        with PipelineLock(owner, guided):
             self._got.set()
 
     @property
@@ -125,14 +125,14 @@ class OtherThread:
 def test_a_guided_call_locks_its_networks_and_any_call_its_pipeline():
     shared = nn.Linear(1, 1)
     one, two = (Pipe(unet=shared, scheduler=object()) for _ in range(2))
-    with Exclusive(one, False):
+    with PipelineLock(one, False):
         assert OtherThread(two, True).ends
         waiting = [OtherThread(one, False)]
         assert waiting[0].waits
-        with Exclusive(one, False):  # of the same thread
+        with PipelineLock(one, False):  # of the same thread
             pass
     assert waiting[0].ends
-    with Exclusive(one, True) as held:
+    with PipelineLock(one, True) as held:
         assert OtherThread(two, False).ends
         waiting = [OtherThread(two, True), OtherThread(one, False)]
         assert all(thread.waits for thread in waiting)
@@ -157,9 +157,9 @@ def test_torch_has_no_more_threads_than_cores_in_guided_calls(monkeypatch):
 
     monkeypatch.setattr(hooks, "WithinCores", Cores)
     pipe = Pipe()
-    with Exclusive(pipe, False):
+    with PipelineLock(pipe, False):
         assert entered == []
-    with Exclusive(pipe, True):
+    with PipelineLock(pipe, True):
         assert entered == ["in"]
     assert entered == ["in", "out"]
 
@@ -193,7 +193,7 @@ class Denoiser(nn.Module):
 def test_the_network_can_be_asked_again_at_another_latent_with_its_gradient(kind, dtype):
     network = Denoiser()
     network.kind = kind
-    tap = DenoiserTap(network, "forward", slice(2, None))
+    tap = DenoiserHook(network, "forward", slice(2, None))
     given = torch.randn(2, 4, 3, 3, generator=torch.Generator().manual_seed(0)).to(dtype)
     expected = network(given, 5.0, scale=0.5)
     with tap.attached(), torch.no_grad():
@@ -234,7 +234,7 @@ def test_the_network_can_be_asked_again_at_another_latent_with_its_gradient(kind
 def test_a_later_call_of_the_network_runs_under_the_autocast_of_the_first():
     network = nn.Linear(4, 4)
     network.kind = "tensor"
-    tap = DenoiserTap(network, "forward", slice(None))
+    tap = DenoiserHook(network, "forward", slice(None))
     x = torch.randn(3, 4)
     with tap.attached():
         with torch.autocast("cpu", torch.bfloat16):
@@ -248,15 +248,15 @@ def test_a_later_call_of_the_network_runs_under_the_autocast_of_the_first():
 class Run:
     """Stands in for a guided run: doubles outputs, shifts latents, moves the result, and notes the rest."""
 
-    def __init__(self, move) -> None:
-        self.move, self.begun, self.guided, self.after = move, [], [], []
+    def __init__(self, offset) -> None:
+        self.offset, self.begun, self.guided, self.after = offset, [], [], []
 
     def begin(self, timesteps):
         self.begun.append(timesteps.clone())
 
     def guide(self, output, timestep, z_t):
         self.guided.append(timestep)
-        return 2.0 * output, z_t + 0.5, self.move
+        return 2.0 * output, z_t + 0.5, self.offset
 
     def after_step(self, timestep, latents):
         self.after.append(timestep)
@@ -265,29 +265,31 @@ class Run:
 
 @pytest.mark.parametrize("return_dict", [True, False])
 @pytest.mark.parametrize("with_move", [True, False])
-@pytest.mark.parametrize("respace", [True, False])
+@pytest.mark.parametrize("trailing_spacing", [True, False])
 @pytest.mark.parametrize("cls", [DDIMScheduler, DPMSolverMultistepScheduler])
-def test_a_step_runs_on_what_the_run_gives_and_its_result_is_moved(cls, respace, with_move, return_dict):
+def test_a_step_runs_on_what_the_run_gives_and_its_result_is_moved(
+    cls, trailing_spacing, with_move, return_dict
+):
     leading = {"timestep_spacing": "leading", "rescale_betas_zero_snr": False}
     options = SCHEDULER | leading if cls is DDIMScheduler else {"timestep_spacing": "leading"}
     generator = torch.Generator().manual_seed(0)
-    output, z, move = torch.randn(3, 1, 4, 3, 3, generator=generator).half()
-    run = Run(move.float() if with_move else None)
+    output, z, offset = torch.randn(3, 1, 4, 3, 3, generator=generator).half()
+    run = Run(offset.float() if with_move else None)
     pipe = SimpleNamespace(scheduler=cls(**options))
     original, reference = pipe.scheduler, cls(**options)
-    guided = GuidedScheduler(pipe, run, respace)
+    guided = GuidedScheduler(pipe, run, trailing_spacing)
     with guided.attached():
         assert pipe.scheduler is not original
         pipe.scheduler.set_timesteps(4, device=torch.device("cpu"))
         reference.set_timesteps(4)
-        if respace and cls is DDIMScheduler:
+        if trailing_spacing and cls is DDIMScheduler:
             reference.timesteps = torch.tensor([999, 749, 499, 249])
         assert torch.equal(run.begun[0], reference.timesteps)
         assert torch.equal(pipe.scheduler.timesteps, reference.timesteps)
         for t in reference.timesteps[:2]:
             given = int(t) if cls is DDIMScheduler else t
             expected = reference.step(2.0 * output, given, z + 0.5).prev_sample
-            expected = (expected.float() + move).half() if with_move else expected
+            expected = (expected.float() + offset).half() if with_move else expected
             found = pipe.scheduler.step(output, t, z, return_dict=return_dict)
             previous = found.prev_sample if return_dict else found[0]
             torch.testing.assert_close(previous, expected + 100.0)

@@ -43,14 +43,14 @@ def test_a_device_of_this_machine_is_picked(found, cards, apple, name, device):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("cuda:2", "got 'cuda:2'. PyTorch finds 2 cuda here"),
-        ("mps", "got 'mps'. PyTorch finds no mps here"),
-        ("cpu:1", "got 'cpu:1'. PyTorch finds 1 cpu here"),
+        ("cuda:2", "got 'cuda:2'. PyTorch finds 2 cuda devices"),
+        ("mps", "got 'mps'. PyTorch finds no mps devices"),
+        ("cpu:1", "got 'cpu:1'. PyTorch finds 1 cpu devices"),
         ("gpu", "must be auto, cpu, cuda, cuda:N or mps; got 'gpu'"),
         ("meta", "must be auto, cpu, cuda, cuda:N or mps; got 'meta'"),
     ],
 )
-def test_what_is_not_there_is_refused(found, name, message):
+def test_what_is_not_there_is_rejected(found, name, message):
     found(2, False)
     with pytest.raises(ValueError, match=message):
         pick_device(name)

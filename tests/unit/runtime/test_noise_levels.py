@@ -83,7 +83,8 @@ def test_leading_schedules_of_ddim_become_trailing_ones():
         ),
         (
             DDIMScheduler(rescale_betas_zero_snr=True),
-            r"must be able to tell .*; got DDIMScheduler with prediction_type='epsilon' and .*\. Noise alone",
+            r"must be able to compute .*; got DDIMScheduler with prediction_type='epsilon' and "
+            r".*\. Noise alone",
         ),
         (
             DDIMScheduler(thresholding=True),
@@ -94,7 +95,7 @@ def test_leading_schedules_of_ddim_become_trailing_ones():
         (DirectScheduler(), None),
     ],
 )
-def test_schedulers_that_determine_no_clean_latent_are_refused(scheduler, message):
+def test_schedulers_that_determine_no_clean_latent_are_rejected(scheduler, message):
     if message is None:
         check_scheduler(scheduler)
         return

@@ -11,27 +11,28 @@ from geodiff_plugin.algorithm.schedule import Round
 from geodiff_plugin.algorithm.step import GuidedStep
 from geodiff_plugin.config import DEFAULT, UpdatePlan
 from geodiff_plugin.evidence.guidance import SAME_CENTRE
-from geodiff_plugin.messages import Message
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.runtime import run as run_module
 from geodiff_plugin.runtime.codec import ProcessingGrid, StepInputs
 from geodiff_plugin.runtime.run import GuidedRun, _latents_of
+from geodiff_plugin.trust import Call
 
 GRID = ProcessingGrid((4, 6), (2, 1))
 CHANNELS = slice(1, 3)
 
 
 class Trajectory:
-    """Notes its samples, what it is told, and of which maps it is asked the result."""
+    """Records its samples, its calls, and the maps of which the result is requested."""
 
-    def __init__(self, config, evidence, image_of_sample, maps, step_latents) -> None:
-        self.made_of = (config, evidence, image_of_sample, maps, step_latents)
-        self.noted, self.history, self.step = [], [], None
+    def __init__(self, config, evidence, image_of_sample, maps, lr_latents) -> None:
+        self.made_of = (config, evidence, image_of_sample, maps, lr_latents)
+        self.captured_warnings, self.history, self.step = [], [], None
         self.affine = SimpleNamespace(scale=torch.tensor(2.0), shift=torch.tensor(7.0))
         self.watch = SimpleNamespace(check=lambda pipe: self.checked.append(pipe))
         self.checked = []
 
-    def note(self, name, tensor):
-        self.noted.append((self.step, name, tensor))
+    def record(self, name, tensor):
+        self.captured_warnings.append((self.step, name, tensor))
 
     def metric(self, x, affine):
         return affine.scale * x + affine.shift
@@ -67,10 +68,12 @@ class Scheduler:
         pass
 
 
-def a_run(*, images=3, members=2, batch=4, callback=None, rounds=1, tiny=None, gradient="denoised", **knobs):
+def a_run(
+    *, images=3, members=2, batch=4, callback=None, rounds=1, tiny=None, gradient="denoised", **parameters
+):
     """A run, and the parts that it was made of; ``steps`` holds what each guided step is to give."""
-    plan = knobs.pop("plan", UpdatePlan(0, 0.0, 0.03))
-    config = DEFAULT.changed(gradient=gradient, **knobs)
+    plan = parameters.pop("plan", UpdatePlan(0, 0.0, 0.03))
+    config = DEFAULT.changed(gradient=gradient, **parameters)
     faster = SimpleNamespace(attached=lambda pipe: run_module.hooks.replaced(pipe, "was_faster", True))
     prior = Prior()
     pipe = SimpleNamespace(
@@ -83,15 +86,17 @@ def a_run(*, images=3, members=2, batch=4, callback=None, rounds=1, tiny=None, g
         decode=lambda z0, final=False: decoded.append((z0, final)) or z0.sum(1, keepdim=True),
     )  # fmt: skip
     guidance = SimpleNamespace(
+        fill=True,
         config=config, inputs=[None] * images, updates=plan, through_network=gradient == "full",
-        unit="m", assumed=[],
+        unit="m", calibrated=False,
     )  # fmt: skip
     call = {
         "image": torch.zeros(images, 3, 4, 6), "ensemble_size": members, "batch_size": batch,
         "output_latent": False, "resample_method_output": "bicubic", "ensembling_kwargs": None,
         "output_type": "pt",
     }  # fmt: skip
-    made = GuidedRun(codec, guidance, lambda: ["evidence"] * images, call, rounds, callback)
+    plan = SimpleNamespace(evidence="evidence", complete=lambda: "complete evidence")
+    made = GuidedRun(codec, guidance, lambda: [plan] * images, call, rounds, callback)
     return SimpleNamespace(run=made, pipe=pipe, codec=codec, guidance=guidance, call=call, decoded=decoded)
 
 
@@ -104,8 +109,8 @@ def steps(monkeypatch):
         def __init__(self, *arguments) -> None:
             now.estimates.append(arguments)
 
-        def step_inputs(self, move, from_moved):
-            return StepInputs("output", "z_t", (move, from_moved))
+        def step_inputs(self, offset, from_updated):
+            return StepInputs("output", "z_t", (offset, from_updated))
 
     def guided_step(trajectory, estimate, rounds, is_last):
         now.number += 1
@@ -134,7 +139,7 @@ def test_samples_of_all_images_are_guided_chunk_by_chunk(steps):
             output, z_t = latents(seed=10 * chunk + k), latents(seed=100 + 10 * chunk + k)
             inputs = run.guide(output, t, z_t)
             if k == 0:
-                assert inputs.output is output and inputs.z_t is z_t and inputs.move is None
+                assert inputs.output is output and inputs.z_t is z_t and inputs.offset is None
                 assert len(run.trajectories) == chunk
             else:
                 assert inputs == ("output", "z_t", ("move", False))
@@ -146,7 +151,7 @@ def test_samples_of_all_images_are_guided_chunk_by_chunk(steps):
     for chunk, (trajectory, images) in enumerate(zip(run.trajectories, ([0, 0, 1, 1], [2, 2]), strict=True)):
         samples = slice(4 * chunk, 4 * chunk + 4)
         assert trajectory.made_of == (config, ["evidence"] * 3, images, ("maps", samples), 0.07)
-        ((step, name, first),) = trajectory.noted
+        ((step, name, first),) = trajectory.captured_warnings
         assert step == (0, 900.0) and "output" in name
         assert torch.equal(first, latents(seed=10 * chunk)[:, CHANNELS])
         guided = [each[1:] for each in steps.guided if each[0] is trajectory]
@@ -159,14 +164,14 @@ def test_samples_of_all_images_are_guided_chunk_by_chunk(steps):
 
 
 def test_several_rounds_a_step_and_a_prior_whose_map_cannot_be_encoded(steps):
-    made = a_run(rounds=3, corrections=2, plan=UpdatePlan(1, 0.0, 0.1))
+    made = a_run(rounds=3, match_fits=2, plan=UpdatePlan(1, 0.0, 0.1))
     made.run.begin(torch.tensor([9, 3]))
     assert [len(rounds) for rounds in made.run.schedule.steps] == [3, 3]
-    assert any(r.corrects for rounds in made.run.schedule.steps for r in rounds)
+    assert any(r.fits_matches for rounds in made.run.schedule.steps for r in rounds)
     full = a_run(gradient="full", plan=UpdatePlan(1, 0.0, 0.1))
     full.run.begin(torch.tensor([9, 3]))
-    assert not any(r.corrects for rounds in full.run.schedule.steps for r in rounds)
-    assert full.run._tap is not None and made.run._tap is None
+    assert not any(r.fits_matches for rounds in full.run.schedule.steps for r in rounds)
+    assert full.run._denoiser is not None and made.run._denoiser is None
 
 
 @pytest.mark.parametrize("current", [True, False])
@@ -174,7 +179,7 @@ def test_several_rounds_a_step_and_a_prior_whose_map_cannot_be_encoded(steps):
 @pytest.mark.parametrize("read", [True, False])
 def test_the_result_starts_from_a_current_map_unless_the_tiny_decoder_made_it(steps, current, tiny, read):
     """That decodes the map of every step whose latent is read: of all but the last, or of all."""
-    made = a_run(tiny=tiny, corrections=2)
+    made = a_run(tiny=tiny, match_fits=2)
     made.run._reads_latents = read
     steps.current = current
     run = made.run
@@ -189,7 +194,7 @@ def test_the_result_starts_from_a_current_map_unless_the_tiny_decoder_made_it(st
 
 
 def test_a_step_that_is_not_guided_has_no_map_for_the_result(steps):
-    made = a_run(stop=0.5, corrections=1)
+    made = a_run(guidance_end=0.5, match_fits=1)
     made.run.begin(torch.tensor([9, 3]))
     for t in (9, 3):
         made.run.guide(latents(), torch.tensor(t), latents())
@@ -198,21 +203,21 @@ def test_a_step_that_is_not_guided_has_no_map_for_the_result(steps):
 
 
 @pytest.mark.parametrize(
-    ("knobs", "moved"), [({"step_from": "updated"}, True), ({"step_from": "given"}, False)]
+    ("parameters", "moved"), [({"step_from": "updated"}, True), ({"step_from": "given"}, False)]
 )
-def test_the_move_is_given_to_the_estimate_as_configured(steps, knobs, moved):
-    made = a_run(plan=UpdatePlan(1, 0.0, 0.1), **knobs)
+def test_the_move_is_given_to_the_estimate_as_configured(steps, parameters, moved):
+    made = a_run(plan=UpdatePlan(1, 0.0, 0.1), **parameters)
     made.run.begin(torch.tensor([9]))
-    assert made.run.guide(latents(), torch.tensor(9), latents()).move == ("move", moved)
-    still = a_run(plan=UpdatePlan(1, 0.0, 0.1), optimize_latents=False, **knobs)
+    assert made.run.guide(latents(), torch.tensor(9), latents()).offset == ("move", moved)
+    still = a_run(plan=UpdatePlan(1, 0.0, 0.1), optimize_latents=False, **parameters)
     still.run.begin(torch.tensor([9]))
     output, z_t = latents(), latents(seed=1)
     inputs = still.run.guide(output, torch.tensor(9), z_t)
-    assert inputs.output is output and inputs.z_t is z_t and inputs.move is None
+    assert inputs.output is output and inputs.z_t is z_t and inputs.offset is None
 
 
 def test_final_maps_are_decoded_chunk_by_chunk_where_no_map_is_kept(steps):
-    made = a_run(batch=2, corrections=1)
+    made = a_run(batch=2, match_fits=1)
     run = made.run
     for k, current in enumerate((True, False, True)):
         steps.current = current
@@ -240,7 +245,7 @@ def test_a_callback_sees_the_latest_guided_step_and_the_decoded_end(steps):
         hooked.append("_guided_run" in vars(pipe))
         seen.append((pipe, i, int(t), dict(values)))
 
-    made = a_run(callback=callback, corrections=2, start=0.3)
+    made = a_run(callback=callback, match_fits=2, guidance_start=0.3)
     run = made.run
     with run:
         assert vars(made.pipe)["_guided_run"] is run
@@ -273,7 +278,7 @@ def test_latents_that_a_callback_changes_are_decoded_again(steps, how):
             values["latents"] += 1.0
         return {"other": 1} if how == "elsewhere" else None
 
-    made = a_run(callback=callback, corrections=1)
+    made = a_run(callback=callback, match_fits=1)
     made.run.begin(torch.tensor([9]))
     made.run.guide(latents(), torch.tensor(9), latents())
     given = latents()
@@ -286,19 +291,20 @@ def test_latents_that_a_callback_changes_are_decoded_again(steps, how):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (3, r"^the answer of callback_on_step_end must be a dict or None; got int\. Return"),
+        (3, r"^the return value of callback_on_step_end must be a dict or None; got int\. Return"),
         (
             {"latents": torch.zeros(2, 5, 3, 3)},
-            r"^latents in the answer .* a tensor of shape \(2, 5, 3, 4\); got \(2, 5, 3, 3\)\. Return",
+            r"^latents in the return value .* a tensor of shape \(2, 5, 3, 4\); got \(2, 5, 3, 3\)\. Return",
         ),
         ({"latents": "x"}, "got str"),
         (
             {"latents": torch.full((2, 5, 3, 4), torch.inf)},
-            r"^latents in the answer of callback_on_step_end must be finite; got NaN or infinity\. Return",
+            r"^latents in the return value of callback_on_step_end must be finite; "
+            r"got NaN or infinity\. Return",
         ),
     ],
 )
-def test_answers_that_are_no_latents_are_refused(answer, message):
+def test_answers_that_are_no_latents_are_rejected(answer, message):
     with pytest.raises((ValueError, TypeError), match=message):
         _latents_of(answer, latents())
 
@@ -334,7 +340,7 @@ def test_hooks_are_in_place_within_the_block_alone(monkeypatch):
 
 @pytest.mark.parametrize(("samples", "batch", "chunks"), [(6, 4, 2), (6, 3, 2), (6, 6, 1), (2, 4, 1)])
 def test_the_bar_counts_the_steps_of_all_chunks_and_shows_the_loss(steps, samples, batch, chunks):
-    made = a_run(images=samples // 2, batch=batch, corrections=2)
+    made = a_run(images=samples // 2, batch=batch, match_fits=2)
     made.pipe._progress_bar_config = {"disable": False, "leave": False, "file": open("/dev/null", "w")}  # noqa: SIM115
     run, shown = made.run, []
     for _ in range(chunks):
@@ -351,7 +357,7 @@ def test_the_bar_counts_the_steps_of_all_chunks_and_shows_the_loss(steps, sample
 
 
 def test_the_loss_is_shown_only_if_it_can_be_read_at_once(steps):
-    made = a_run(corrections=1)
+    made = a_run(match_fits=1)
     run, shown = made.run, []
     run.begin(torch.tensor([9, 3]))
     run._bar = SimpleNamespace(
@@ -367,10 +373,7 @@ def test_the_loss_is_shown_only_if_it_can_be_read_at_once(steps):
     assert shown == []
 
 
-DOUBT, REMARK = (
-    SimpleNamespace(code="a", forbids_trust=True),
-    SimpleNamespace(code="b", forbids_trust=False),
-)
+DOUBT, WARNING = Finding("calibration.assumed-metres", "Metres?"), Finding("image.dark", "Dark.")
 
 
 @pytest.mark.parametrize("spread", [True, False])
@@ -388,12 +391,13 @@ def test_each_image_is_finished_with_its_own_members_map_and_spread(monkeypatch,
 
     monkeypatch.setattr(run_module, "finish", finish)
     monkeypatch.setattr(run_module, "stack_results", stack)
-    made = a_run(batch=4)
+    made = a_run(batch=4, **{"depth_range": (0.5, 9.0)} if given else {})
     run, call = made.run, made.call
     if given:
-        made.guidance.unit, made.guidance.assumed = None, [SAME_CENTRE]
+        made.guidance.unit = None
         call |= {"ensembling_kwargs": {"reduction": "mean"}, "output_type": "np"}
-    run._evidence = lambda: ["first", "second", "third"]
+    plans = [SimpleNamespace(complete=lambda name=name: name) for name in ("first", "second", "third")]
+    run._plans = lambda: plans
     run.members = list(range(6))
     for k in range(2):
         run.trajectories.append(Trajectory(*range(5)))
@@ -402,17 +406,16 @@ def test_each_image_is_finished_with_its_own_members_map_and_spread(monkeypatch,
     stock = SimpleNamespace(prediction=maps, uncertainty=spreads if spread else None, extras={"normals": 5})
     if not given:
         del stock.extras
-    assert run.output(stock, [DOUBT, REMARK]) == "output"
+    assert run.output(stock, [DOUBT, SAME_CENTRE, WARNING]) == "output"
     for k, (evidence, members, depth_m, its_spread, options) in enumerate(finished):
         assert evidence == ("first", "second", "third")[k] and members == [2 * k, 2 * k + 1]
         assert depth_m.item() == k and (its_spread.item() == 10 + k if spread else its_spread is None)
         assert options.config is made.guidance.config and options.resampling == "bicubic"
         assert options.reduction == ("mean" if given else "median")
-        assert options.has_unit != given and options.centre_assumed == given
-        assert options.doubts == (DOUBT,)
+        assert options.call == Call(not given, given, (DOUBT, SAME_CENTRE, WARNING)) and options.fill
     assert stacked["results"] == ["result 1", "result 2", "result 3"]
     assert stacked["guidance"] is made.guidance and stacked["history"] == ["0 a", "0 b", "1 a", "1 b"]
-    assert stacked["remarks"] == [REMARK] and stacked["as_numpy"] == given
+    assert stacked["findings"] == [SAME_CENTRE, WARNING] and stacked["as_numpy"] == given
     assert stacked["extras"] == ({"normals": 5} if given else {})
     assert [trajectory.checked for trajectory in run.trajectories] == [[made.pipe]] * 2
 
@@ -433,4 +436,3 @@ def test_tensors_that_are_not_finite_are_reported_also_if_the_result_fails(monke
     stock = SimpleNamespace(prediction=torch.ones(1, 1, 1, 1), uncertainty=None)
     with pytest.raises(ValueError, match="not finite"):
         made.run.output(stock, [])
-    assert isinstance(SAME_CENTRE, Message)

@@ -39,8 +39,7 @@ def interpreted(name: str) -> Iterator[ModuleType]:
 
 def _kernel_modules() -> list[str]:
     """The modules of Triton kernels that are imported."""
-    names = [name for name in sys.modules if name.startswith("geodiff_plugin.") and name.endswith("kernels")]
-    return [name for name in names if name != "geodiff_plugin._kernels"]
+    return [name for name in sys.modules if name.startswith("geodiff_plugin.") and ".kernels." in name]
 
 
 def _place_of(module: str) -> tuple[ModuleType, str]:

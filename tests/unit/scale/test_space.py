@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from geodiff_plugin import InputError
+from geodiff_plugin.scale.affine import AffineState
 from geodiff_plugin.scale.space import (
     SPACES,
-    AffineState,
     DepthRange,
     MetricMap,
+    cat_samples,
     inverse_softplus,
-    joined,
     smooth_floor,
 )
 from tests.unit.scale.references import tensor
@@ -149,7 +149,7 @@ def test_helpers_of_states_and_ranges():
     y = tensor([1e-4, 0.1, 1.0, 30.0])
     np.testing.assert_allclose(np.log1p(np.exp(inverse_softplus(y).double().numpy())), y, rtol=1e-4)
     one, two = torch.arange(2.0), torch.arange(3.0)
-    assert joined([one]) is one and joined([two, one]).tolist() == [0, 1, 2, 0, 1]
+    assert cat_samples([one]) is one and cat_samples([two, one]).tolist() == [0, 1, 2, 0, 1]
     searched = DepthRange(tensor([1, 2, 3]), tensor([4, 5, 6]), torch.tensor([True, False, True]))
     part = searched.of(slice(1, 3))
     assert [each.tolist() for each in part] == [[2, 3], [5, 6], [False, True]]
@@ -173,3 +173,37 @@ def test_depth_between_two_ends_is_linear_in_the_space(space):
     a, b = (NEAR, FAR) if space in ("depth", "log", "log1p") else (FAR, NEAR)
     ends = to[space](a)[:, None], to[space](b)[:, None]
     np.testing.assert_allclose(to[space](found), ends[0] + (ends[1] - ends[0]) * x, rtol=1e-4)
+
+
+NEAR_METRIC, FAR_METRIC = torch.tensor([0.5, 4.0, 0.8]), torch.tensor([0.9, 80.0, 60.0])
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_the_formulas_of_a_space_belong_together(space):
+    kind, near, far = SPACES[space], NEAR_METRIC.double(), FAR_METRIC.double()
+    depth = torch.stack([near, torch.sqrt(near * far), far])
+    g = torch.tensor([0.5, 2.0, 30.0], dtype=torch.float64)
+    torch.testing.assert_close(kind.forward(kind.inverse(depth / g), g), depth)
+    v = kind.inverse(depth)
+    assert ((v[1:] > v[:-1]) == kind.grows_with_depth).all()
+    s, t, unit = kind.from_ends(*kind.ends(near, far))
+    at_zero, at_one = kind.ends(kind.forward(t, unit), kind.forward(s + t, unit))
+    torch.testing.assert_close((at_zero, at_one), (near, far))
+    assert (s > 0).all() and (t > 0).all()
+    x = torch.linspace(0, 1, 9, dtype=torch.float64)
+    between = kind.depth_at(x, near[:, None], far[:, None])
+    torch.testing.assert_close(between, kind.forward(s[:, None] * x + t[:, None], unit[:, None]))
+    torch.testing.assert_close(kind.ends(between[:, 0], between[:, -1]), (near, far))
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_squares_start_at_one_and_clip(space):
+    metric = MetricMap(space, "square")
+    affine = metric.from_range(NEAR_METRIC, FAR_METRIC)
+    assert torch.equal(affine.s_hat, torch.ones(3)) and torch.equal(affine.t_hat, torch.ones(3))
+    torch.testing.assert_close(metric.range_of(affine), (NEAR_METRIC, FAR_METRIC), rtol=2e-3, atol=0)
+    beyond = torch.tensor([-0.5, 1.5]).view(1, 1, 1, 2).requires_grad_()
+    depth = metric(beyond.expand(3, -1, -1, -1), affine)
+    ends = SPACES[space].ends(*depth.flatten(1).unbind(1))
+    torch.testing.assert_close(ends, metric.range_of(affine))
+    assert torch.autograd.grad(depth.sum(), beyond)[0].abs().max() == 0

@@ -1,0 +1,1 @@
+"""Networks of other authors, as callables for ``examples.learned_stereo``."""

@@ -1,0 +1,118 @@
+"""Frames of a rig from messages, and messages from their results; needs no ROS."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from geodiff_plugin import LiveFrame, Rig, StereoFrame
+from geodiff_plugin.formats.ros_messages import (
+    AsSequence,
+    Types,
+    camera_info_message,
+    depth_values,
+    image_message,
+    images_of_messages,
+    rig_of_messages,
+    sigma_values,
+)
+from geodiff_plugin.streaming.newest import Newest
+
+HEADER = "std_msgs/msg/Header"
+DIAGNOSTICS, STATUS, KEY_VALUE = (
+    f"diagnostic_msgs/msg/{name}" for name in ("DiagnosticArray", "DiagnosticStatus", "KeyValue")
+)
+#: Levels of ``DiagnosticStatus``.
+OK, WARN = b"\x00", b"\x01"
+
+
+class MessageSource:
+    """Frames for ``geodiff_plugin.live`` from messages: the newest pair is next; its header is the stamp."""
+
+    def __init__(self) -> None:
+        self._pairs = Newest[tuple[Any, Any]]()
+        self._infos: dict[str, Any] = {}
+        self._has_both = threading.Event()
+
+    def camera_info(self, side: str, info: Any) -> None:
+        """Take the ``CameraInfo`` of ``"left"`` or ``"right"``; only the first one is used."""
+        self._infos.setdefault(side, info)
+        if len(self._infos) == 2:
+            self._has_both.set()
+
+    def images(self, left: Any, right: Any) -> None:
+        """Take the images of one moment, in place of a pair that has not been processed yet."""
+        self._pairs.put((left, right))
+
+    def rig(self, rectified: bool) -> Rig | None:
+        """Wait for the cameras and return their rig; ``None`` if the source was closed before."""
+        self._has_both.wait()
+        if len(self._infos) < 2:
+            return None
+        return rig_of_messages(self._infos["left"], self._infos["right"], rectified)
+
+    def close(self) -> None:
+        """End the frames."""
+        self._has_both.set()
+        self._pairs.close()
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        while (pair := self._pairs.take()) is not None:
+            left, right = pair
+            yield StereoFrame(*images_of_messages(left, right), stamp=left.header)
+
+
+@dataclass(frozen=True)
+class Results:
+    """Makes the messages of a result.
+
+    Attributes:
+        types: message classes by full name.
+        encoding: ``"32FC1"`` or ``"16UC1"``.
+        min_confidence: depths with a lower confidence are unknown.
+        as_sequence: converts an array to the type of a message's sequences.
+        as_level: converts a level of ``DiagnosticStatus`` to the type of its field.
+    """
+
+    types: Types
+    encoding: str = "32FC1"
+    min_confidence: float = 0.0
+    as_sequence: AsSequence = np.asarray
+    as_level: Callable[[bytes], Any] = bytes
+
+    def messages(self, frame: LiveFrame) -> dict[str, Any]:
+        """Return the messages of a frame by topic, all with the header of its left image."""
+        output, header = frame.output.with_holes(self.min_confidence), frame.stamp
+        depth_m, messages = output.prediction[0, ..., 0], {}
+        if output.sigma is not None:
+            confidence = frame.output.confidence[0, ..., 0].astype("<f4")
+            messages["depth/confidence"] = self._image(header, confidence, "32FC1")
+            sigma = sigma_values(output.sigma[0, ..., 0], self.encoding)
+            messages["depth/sigma"] = self._image(header, sigma, self.encoding)
+        K, size = np.asarray(output.K)[0].astype(np.float64), (depth_m.shape[1], depth_m.shape[0])
+        return messages | {
+            "depth/image": self._image(header, depth_values(depth_m, self.encoding), self.encoding),
+            "depth/camera_info": camera_info_message(self.types, header, K, size, self.as_sequence),
+            "/diagnostics": self._diagnostics(frame),
+        }
+
+    def _image(self, header: Any, values: np.ndarray, encoding: str) -> Any:
+        return image_message(self.types, header, values, encoding, self.as_sequence)
+
+    def _diagnostics(self, frame: LiveFrame) -> Any:
+        verdict = frame.output.verdict
+        entries = {"latency_ms": f"{1000 * frame.latency_s:.0f}", "frame": str(frame.number)}
+        entries |= {"checked": str(frame.checked).lower()}
+        status = self.types[STATUS](
+            level=self.as_level(OK if verdict.trusted else WARN),
+            name="geodiff: depth",
+            message=f"{verdict.status}: {' '.join(verdict.reasons)}" if verdict.reasons else verdict.status,
+            hardware_id="",
+            values=[self.types[KEY_VALUE](key=key, value=value) for key, value in entries.items()],
+        )
+        header = self.types[HEADER](stamp=frame.stamp.stamp, frame_id="")
+        return self.types[DIAGNOSTICS](header=header, status=[status])

@@ -1,0 +1,615 @@
+"""Define ``Finding``: a message for the user with a code and a severity.
+
+``FINDINGS`` lists the kinds of findings that readers and jobs report. The checks of a result declare their
+own kinds (``geodiff_plugin.trust``). docs/reference/messages.md is generated from both.
+
+Layer 0: imports nothing; everything above imports it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+#: Maximum number of names that a message lists.
+MAX_NAMES = 5
+#: Maximum number of characters of a name in a message, because a file may contain a name of any length.
+MAX_NAME_LENGTH = 60
+
+
+class Severity(Enum):
+    """How a finding affects a result."""
+
+    REASON = "reason"  # the result is not trusted
+    REMARK = "remark"  # unusual, but possibly correct
+    ASSUMPTION = "assumption"  # the result is correct if the assumption holds
+    WARNING = "warning"  # how the input was handled
+
+
+REASON, REMARK = Severity.REASON, Severity.REMARK
+ASSUMPTION, WARNING = Severity.ASSUMPTION, Severity.WARNING
+
+
+@dataclass(frozen=True)
+class FindingKind:
+    """Title, cause and hint that all findings with one code share."""
+
+    code: str
+    severity: Severity
+    title: str
+    cause: str
+    hint: str
+    explains: tuple[str, ...] = ()  # codes of reasons that it suppresses; "*" for all
+
+
+class Finding(str):
+    """A message for the user that also has a code and a severity.
+
+    A finding is a ``str`` and prints, joins and compares like its text. Programs use ``code`` and
+    ``severity``. The results of ``str`` methods and of ``+`` are plain strings without a code.
+
+    >>> [finding.code for finding in out.findings if finding.severity is Severity.WARNING]
+    ['pose.refined']
+
+    Raises:
+        KeyError: The code is not in ``FINDINGS``.
+    """
+
+    __slots__ = ("_kind",)
+    _kind: FindingKind
+
+    def __new__(cls, kind: FindingKind | str, text: str) -> Finding:  # noqa: D102 - the class is documented
+        if isinstance(kind, str) and kind not in FINDINGS:
+            raise KeyError(f"{kind!r} is not a code in FINDINGS")
+        finding = super().__new__(cls, text)
+        finding._kind = FINDINGS[kind] if isinstance(kind, str) else kind
+        return finding
+
+    def __getnewargs__(self) -> tuple[FindingKind, str]:  # type: ignore[override]  # for copies and pickles
+        return self._kind, str(self)
+
+    @property
+    def kind(self) -> FindingKind:
+        """The declaration of this code: title, cause and hint."""
+        return self._kind
+
+    @property
+    def code(self) -> str:
+        """The code, such as ``"depth.inverted-order"``."""
+        return self._kind.code
+
+    @property
+    def severity(self) -> Severity:
+        """How the finding affects the result."""
+        return self._kind.severity
+
+    @property
+    def is_reason(self) -> bool:
+        """Whether a result with this finding is not trusted."""
+        return self._kind.severity is REASON
+
+    def labelled(self, label: str) -> Finding:
+        """Return the finding with ``label`` prepended to its text."""
+        return Finding(self._kind, label + self)
+
+    def as_record(self) -> dict[str, Any]:
+        """Return the finding as a JSON record of a report."""
+        return {"code": self.code, "severity": self.severity.value, "text": str(self)}
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Join the first ``MAX_NAMES`` names and append the number of the others."""
+    shown = (
+        name if len(name) <= MAX_NAME_LENGTH else f"{name[:MAX_NAME_LENGTH]}..." for name in names[:MAX_NAMES]
+    )
+    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+    return ", ".join(shown) + more
+
+
+def dedupe(*groups: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return the findings of all groups in order, without duplicate texts."""
+    return tuple(dict.fromkeys(finding for group in groups for finding in group))
+
+
+def as_records(*groups: Iterable[Finding]) -> list[dict[str, Any]]:
+    """Return the findings of all groups as JSON records, without duplicate texts."""
+    return [finding.as_record() for finding in dedupe(*groups)]
+
+
+#: Prefix of the codes of a group (the part before the dot) -> heading of the group on the page.
+GROUPS = {
+    "image": "Images",
+    "camera": "Camera matrices",
+    "calibration": "Calibration files",
+    "baseline": "Baselines",
+    "pose": "Given poses",
+    "estimate": "Estimated poses",
+    "scale": "Scale",
+    "points": "Known points",
+    "views": "Image pairs",
+    "depth": "Depth",
+    "prior": "Priors",
+    "capture": "Captures",
+    "pairs": "Batches of pairs",
+    "config": "Configurations",
+    "verdict": "Verdict",
+}
+
+_KINDS = (
+    FindingKind(
+        "image.frames",
+        WARNING,
+        "Only the first frame of the image file is used",
+        cause="The image file holds several frames or pages.",
+        hint="Save the frame you need as a separate file.",
+    ),
+    FindingKind(
+        "image.dark",
+        WARNING,
+        "A 16-bit image is nearly black",
+        cause="The camera has 10 or 12 bits, and its values were stored without scaling.",
+        hint="Multiply the values by 64 (10 bits) or 16 (12 bits).",
+    ),
+    FindingKind(
+        "image.bits",
+        WARNING,
+        "16-bit images of a bag are interpreted as 10, 12 or 14 bits",
+        cause="The camera has 10, 12 or 14 bits, and its driver stores the values without scaling.",
+        hint="Ignore the warning, unless the camera has 16 bits and the scene was dark.",
+    ),
+    FindingKind(
+        "image.alpha",
+        WARNING,
+        "Pixels with alpha 0 are not valid",
+        cause="The image has four channels.",
+        hint="Remove the alpha channel if transparent pixels show the scene.",
+    ),
+    FindingKind(
+        "image.rotated",
+        WARNING,
+        "The image was rotated according to its EXIF orientation",
+        cause="The camera stored the image in another orientation and recorded that in EXIF.",
+        hint="Give the K of the upright image.",
+    ),
+    FindingKind(
+        "image.orientation",
+        WARNING,
+        "The EXIF orientation is not applied",
+        cause="In-memory images are used as is.",
+        hint="Call PIL.ImageOps.exif_transpose first, and give the K of the upright image.",
+    ),
+    FindingKind(
+        "camera.from-exif",
+        ASSUMPTION,
+        "K is estimated from the EXIF focal length",
+        cause="Neither K nor a field of view was given.",
+        hint="Ignore this if an error of a few percent is acceptable; otherwise calibrate the camera.",
+    ),
+    FindingKind(
+        "camera.from-list",
+        ASSUMPTION,
+        "The focal length is a manufacturer's value for a camera chosen in the web app",
+        cause="The image files have no EXIF focal length.",
+        hint="Use images with EXIF data, or calibrate the camera.",
+    ),
+    FindingKind(
+        "camera.from-fov",
+        ASSUMPTION,
+        "The field of view is the one entered in the web app",
+        cause="The image files have no EXIF focal length.",
+        hint="Use images with EXIF data, or calibrate the camera.",
+    ),
+    FindingKind(
+        "camera.assumed-intrinsics",
+        ASSUMPTION,
+        "Missing intrinsics are assumed",
+        cause="Only a focal length was given.",
+        hint="Give the calibrated fy, cx and cy (--fy, --cx, --cy).",
+    ),
+    FindingKind(
+        "camera.zoom",
+        WARNING,
+        "The image was zoomed digitally",
+        cause="Some cameras do not include a digital zoom in their EXIF focal length.",
+        hint="Take the image without zoom, or give K.",
+    ),
+    FindingKind(
+        "camera.assumed-cx",
+        ASSUMPTION,
+        "The right camera's cx is assumed to equal the left camera's",
+        cause="Only one K was given for two parallel cameras.",
+        hint="Give the right camera's matrix (K_right, --K-right) or its cx (--cx-right).",
+    ),
+    FindingKind(
+        "camera.principal-point",
+        REASON,
+        "The principal point is far from the image centre",
+        cause="K belongs to an image of another size.",
+        hint="Scale K with the image; for a cropped image set cropped=True (--cropped).",
+    ),
+    FindingKind(
+        "camera.aspect-ratio",
+        WARNING,
+        "fx and fy differ by more than a factor of two",
+        cause="One of them has a mistyped digit, or the image was stretched.",
+        hint="Check both focal lengths.",
+    ),
+    FindingKind(
+        "camera.focal-mismatch",
+        WARNING,
+        "The focal length in K contradicts the EXIF focal length",
+        cause="K belongs to an image of another size or to another lens.",
+        hint="Check the image size that K was calibrated for, and scale K.",
+    ),
+    FindingKind(
+        "calibration.no-unit",
+        WARNING,
+        "The calibration has no unit of length",
+        cause="Structure-from-motion models have an unknown scale.",
+        hint="Give the measured baseline (baseline_m, --baseline).",
+    ),
+    FindingKind(
+        "calibration.assumed-metres",
+        REASON,
+        "The calibration's unit is assumed to be metres",
+        cause="The file states no unit, and in metres its baseline would be longer than 1.5 m.",
+        hint="Give the measured baseline (baseline_m, --baseline), or state the unit in the file, as in "
+        "translation_mm.",
+    ),
+    FindingKind(
+        "calibration.unrectified",
+        WARNING,
+        "The images are treated as unrectified",
+        cause="The calibration describes both raw and rectified images, and the matches fit raw images.",
+        hint="If the images are rectified, give a file that contains only P1 and P2.",
+    ),
+    FindingKind(
+        "calibration.doffs",
+        WARNING,
+        "The right cx in a Middlebury file contradicts doffs",
+        cause="cam1 is missing, or its cx differs from cx0 + doffs, on which the ground truth is based.",
+        hint="Ignore the warning if the file is the published one; otherwise correct doffs or cam1.",
+    ),
+    FindingKind(
+        "calibration.assumed-lens",
+        WARNING,
+        "The focal length of SceneFlow images is assumed",
+        cause="camera_data.txt has no intrinsics, and the folder name does not state the lens.",
+        hint="Ignore the warning for 35 mm; otherwise keep Driving's folder 15mm_focallength in the path.",
+    ),
+    FindingKind(
+        "calibration.kitti-cameras",
+        WARNING,
+        "KITTI's colour cameras are used",
+        cause="The calibration holds a greyscale and a colour pair, and neither was selected.",
+        hint="Select two cameras (cameras, --cameras).",
+    ),
+    FindingKind(
+        "baseline.long",
+        REASON,
+        "The baseline is longer than 20 m",
+        cause="The translation is in millimetres.",
+        hint="Divide E[:3, 3], or the baseline, by 1000. If it is in metres, give the depth range of the "
+        "scene (depth_range, --near, --far).",
+    ),
+    FindingKind(
+        "estimate.second-motion",
+        WARNING,
+        "Part of the scene moved",
+        cause="An object moved between the images, or the scene has a repetitive pattern.",
+        hint="Capture both images simultaneously, or capture a static scene.",
+    ),
+    FindingKind(
+        "estimate.learned",
+        ASSUMPTION,
+        "The poses are from learned matches",
+        cause="SIFT gives no pose, because the images are dark or blurred, or have little or repetitive "
+        "texture.",
+        hint="Check the result, for example with a known length. Take brighter, sharper images.",
+    ),
+    FindingKind(
+        "estimate.parallax",
+        WARNING,
+        "The parallax is small",
+        cause="The camera hardly moved sideways.",
+        hint="Move sideways by 1/20 to 1/5 of the distance to the object you measure.",
+    ),
+    FindingKind(
+        "estimate.plane",
+        WARNING,
+        "Nearly all matches lie on one plane",
+        cause="The images show a wall, a floor or a poster.",
+        hint="Include objects at different depths, or give the pose.",
+    ),
+    FindingKind(
+        "estimate.unconstrained",
+        WARNING,
+        "The matches do not constrain the estimated pose",
+        cause="The images have little texture or a short baseline.",
+        hint="Take other images, or give the pose.",
+    ),
+    FindingKind(
+        "scale.none",
+        WARNING,
+        "The scale is unknown",
+        cause="Two images without a measured length have no metric scale.",
+        hint="Give the baseline, a known length, or known points.",
+    ),
+    FindingKind(
+        "scale.guessed",
+        ASSUMPTION,
+        "The distance between the cameras is a guess",
+        cause="A rough distance was chosen in the web app.",
+        hint="Measure the distance, or give a known length.",
+    ),
+    FindingKind(
+        "scale.from-prior",
+        ASSUMPTION,
+        "The scale comes from the metric prior",
+        cause="No length was given, and the prior predicts metres.",
+        hint="Give a measured length to make the scale independent of the prior.",
+    ),
+    FindingKind(
+        "points.far",
+        REASON,
+        "The known depths look like millimetres",
+        cause="All of them are far away, or they are large integers.",
+        hint="Divide them by 1000, or give their scale (scale=1000, --points-scale 1000).",
+    ),
+    FindingKind(
+        "prior.one-member",
+        WARNING,
+        "Only one ensemble member runs",
+        cause="The prior is deterministic.",
+        hint="Leave ensemble_size (--ensemble) at 1 with this prior.",
+    ),
+    FindingKind(
+        "capture.skipped",
+        WARNING,
+        "Frames are skipped",
+        cause="A frame has no image file, no pose, or an unsupported camera; the message states which.",
+        hint="Ignore the warning if enough frames remain.",
+    ),
+    FindingKind(
+        "capture.part",
+        WARNING,
+        "Only part of the folder is read",
+        cause="The folder has several models, splits or cameras, and one of them is used.",
+        hint="To use another one, give its file or folder.",
+    ),
+    FindingKind(
+        "capture.images-found",
+        WARNING,
+        "Images were found in another folder than the camera file states",
+        cause="The usual folders do not hold the images, but a nearby folder has files with the same names.",
+        hint="Check that they are the right images; if not, give their folder (--images).",
+    ),
+    FindingKind(
+        "capture.masks",
+        WARNING,
+        "Masks of the capture are used",
+        cause="The file names masks (mask_path), or a folder masks is next to the images, as for COLMAP.",
+        hint="If the masks mark something else, such as one object, move the folder, or give one white mask "
+        "(--mask).",
+    ),
+    FindingKind(
+        "image.overlays",
+        WARNING,
+        "A part of the image is static",
+        cause="Text or a logo is burnt into the frames, or a part of the rig is visible.",
+        hint="If it shows the scene, give one white mask (--mask) and report it.",
+    ),
+    FindingKind(
+        "capture.no-mask",
+        WARNING,
+        "Masks that the capture names do not exist",
+        cause="The file has a mask_path for frames whose mask is missing.",
+        hint="Restore the masks, or give their folder (--mask).",
+    ),
+    FindingKind(
+        "capture.unused-poses",
+        WARNING,
+        "Images are read without poses, although poses may exist",
+        cause="The folder also has another program's camera file, or a folder that looks like a capture.",
+        hint="Give the file or folder that the message names, or convert it as the message describes.",
+    ),
+    FindingKind(
+        "capture.no-poses",
+        WARNING,
+        "The camera file has no poses",
+        cause="It was written before the images were aligned.",
+        hint="The poses are estimated. To use the program's own poses, export them after alignment.",
+    ),
+    FindingKind(
+        "capture.size-mismatch",
+        REASON,
+        "The image sizes differ slightly from the calibrated sizes",
+        cause="The images are the ones before undistortion, or come from another export.",
+        hint="Give the folder of the matching images (--images), or the model of these images.",
+    ),
+    FindingKind(
+        "capture.assumed-metres",
+        WARNING,
+        "The unit of a transforms.json is assumed to be metres",
+        cause="The file states no unit and has no depth maps. Devices that record depth maps use metres.",
+        hint="If its poses were estimated from the images, or it was rendered in another unit, give a length "
+        "(--known-length, --distance, --metres-per-unit).",
+    ),
+    FindingKind(
+        "capture.gps-scale",
+        WARNING,
+        "The scale of the capture comes from GPS",
+        cause="OpenSfM aligned the reconstruction with GPS positions, which are accurate to a few metres.",
+        hint="Give --metres-per-unit 1 to accept this scale, or give a measured length.",
+    ),
+    FindingKind(
+        "capture.stored-pixels",
+        WARNING,
+        "The EXIF orientation of the frames is not applied",
+        cause="The cameras of the capture refer to the pixels as stored in the image files.",
+        hint="No action is needed: the depth maps have the stored orientation, too.",
+    ),
+    FindingKind(
+        "capture.assumed-k",
+        WARNING,
+        "K is assumed from the dataset",
+        cause="7-Scenes and TUM RGB-D have no calibration file.",
+        hint="Give K (--K) for other cameras.",
+    ),
+    FindingKind(
+        "capture.no-trajectory",
+        WARNING,
+        "The poses of the video are estimated without scale",
+        cause="No trajectory was given.",
+        hint="Give a trajectory (--trajectory), or a length (--known-length, --distance).",
+    ),
+    FindingKind(
+        "capture.trajectory-times",
+        WARNING,
+        "Many frames have no pose at their time",
+        cause="The trajectory starts at another moment than the video, or has other times than its frames.",
+        hint="Shift the times so that 0 is the first frame. Phones record at a variable rate: use the times "
+        "in the container, not the frame number divided by the rate.",
+    ),
+    FindingKind(
+        "capture.blurred",
+        WARNING,
+        "Some frames are blurred or textureless",
+        cause="Few features were found in these frames.",
+        hint="Ignore the warning: no other frame depends on them. Move the camera more slowly next time.",
+    ),
+    FindingKind(
+        "capture.no-matches",
+        WARNING,
+        "No two frames match",
+        cause="The frames show different scenes, or are not sharp.",
+        hint="Record the scene again, with more overlap.",
+    ),
+    FindingKind(
+        "capture.convention",
+        WARNING,
+        "The poses are read in another convention than the file declares",
+        cause="The matches contradict the declared convention.",
+        hint="Check that the convention in the message is the right one.",
+    ),
+    FindingKind(
+        "capture.unknown-convention",
+        REASON,
+        "The pose convention is unknown",
+        cause="The matches fit no known convention; even the best one leaves large epipolar errors.",
+        hint="Give camera-to-world poses of these images, in OpenCV or OpenGL axes.",
+    ),
+    FindingKind(
+        "capture.rotated",
+        REASON,
+        "The images are rotated relative to their cameras",
+        cause="The images were rotated later, or are stored in another orientation than the poses and K "
+        "assume.",
+        hint="Rotate the images as the message describes, or give poses and K of the images as stored.",
+    ),
+    FindingKind(
+        "capture.focal",
+        WARNING,
+        "The best-fitting focal length is far from the given one",
+        cause="K is for another image size, or the camera motion does not constrain the focal length.",
+        hint="Check K; the given focal length is used.",
+    ),
+    FindingKind(
+        "capture.kept",
+        WARNING,
+        "The given poses are kept",
+        cause="They fit the matches as well as the refined ones.",
+        hint="No action is needed.",
+    ),
+    FindingKind(
+        "capture.scales",
+        WARNING,
+        "Positions and depth maps give different scales",
+        cause="The tracker's lengths are inaccurate.",
+        hint="Give a known length (--known-length).",
+    ),
+    FindingKind(
+        "capture.scale",
+        REASON,
+        "The scale of the capture is uncertain",
+        cause="The scale varies between frames, or the trajectory contradicts the depth of the scene.",
+        hint="Give a known length (--known-length) or a distance (--distance).",
+    ),
+    FindingKind(
+        "capture.length",
+        REASON,
+        "The known length cannot be measured accurately in its frame",
+        cause="An endpoint of --known-length has uncertain depth: it is textureless, on a depth edge, or "
+        "seen by no other frame.",
+        hint="Choose other endpoints, or give a distance (--distance).",
+    ),
+    FindingKind(
+        "capture.wrong-poses",
+        WARNING,
+        "The given poses of some frames are wrong",
+        cause="The tracker jumped.",
+        hint="No action is needed: the estimated poses are used.",
+    ),
+    FindingKind(
+        "capture.unconnected",
+        WARNING,
+        "Some frames are not connected to the others",
+        cause="They share too few points with other frames, or refinement made their fit worse.",
+        hint="Ignore the warning if enough frames remain; otherwise record with more overlap.",
+    ),
+    FindingKind(
+        "capture.components",
+        WARNING,
+        "The capture has several disconnected components",
+        cause="No frames connect them.",
+        hint="Record frames between the components, or process each one separately.",
+    ),
+    FindingKind(
+        "capture.no-video",
+        WARNING,
+        "The video was not written",
+        cause="This OpenCV build has no codec for it.",
+        hint="All other files are written. Install an OpenCV build with video codecs to get the video.",
+    ),
+    FindingKind(
+        "pairs.in-order",
+        WARNING,
+        "The images of two folders are paired in order",
+        cause="The folders have no file name in common.",
+        hint="Check the first and last pair in the message. If they are wrong, give both images of a pair "
+        "the same name.",
+    ),
+    FindingKind(
+        "pairs.side-by-side",
+        WARNING,
+        "One image or video holds both views",
+        cause="--side-by-side is given without a layout, or only one video.",
+        hint="Give another layout if the message is wrong, or both videos if one holds only the left view.",
+    ),
+    FindingKind(
+        "pairs.layout",
+        ASSUMPTION,
+        "The layout of an image or video that holds both views is assumed",
+        cause="No layout is given, and shape and content leave it open.",
+        hint="Give it (--side-by-side full, half, over-under or half-over-under). A wrong one may scale the "
+        "depth by 2 or 0.5.",
+    ),
+    FindingKind(
+        "pairs.offset",
+        ASSUMPTION,
+        "The time between the starts of two videos is estimated",
+        cause="The videos have different lengths, or their brightness changes at different times.",
+        hint="Give the time in seconds by which RIGHT started after LEFT (--offset), or trim both videos to "
+        "the same time span.",
+    ),
+    FindingKind(
+        "config.unknown-parameters",
+        WARNING,
+        "Unknown parameters are ignored",
+        cause="The configuration was saved by an earlier version.",
+        hint="Save the configuration again.",
+    ),
+)
+FINDINGS = {kind.code: kind for kind in _KINDS}

@@ -1,0 +1,72 @@
+"""Reads the valid pixels of a pair: mask files, alpha channels and the empty borders of undistortion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.evidence.valid import both, read_mask, undistorted_mask, without_overlays
+from geodiff_plugin.formats import is_as_stored, read_alpha
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.pose.overlays import reduced, static_pixels
+
+#: Approximate number of samples of a video in which overlays are sought, from its first ``SPAN`` frames.
+SAMPLES, SPAN = 16, 240
+
+
+def read_masks(
+    options: DepthOptions,
+    images: Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    *,
+    from_files: bool,
+    overlays: np.ndarray | None = None,
+) -> list[np.ndarray | None]:
+    """Read the valid pixels ``(H, W)`` bool of each undistorted view, left one first; ``None`` for all.
+
+    ``images (H, W, 3)`` are the raw ones, ``overlays (h, w)`` bool their static pixels. Constant borders are
+    detected here only if a lens bends them, or next to overlays.
+    """
+    flags = (("--mask", options.mask), ("--right-mask", options.right_mask))
+    files = [*flags, *(("", None) for _ in images)]
+    alphas = _alphas(options) if from_files else []
+    masks = []
+    for i, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+        flag, path = files[i]
+        valid = None if path is None else read_mask(path, flag, (image.shape[0], image.shape[1]))
+        valid = both(valid, alphas[i] if i < len(alphas) else None)
+        if overlays is not None:
+            valid = without_overlays(image, valid, overlays)
+        if camera.lens is not None:
+            valid = undistorted_mask(image, valid, camera)
+        masks.append(None if valid is None else valid.numpy())
+    return masks
+
+
+def find_overlays(read: Callable[[int], Sequence[np.ndarray] | None]) -> np.ndarray | None:
+    """Find ``static_pixels`` of a video of a rig.
+
+    ``read`` returns both views of a frame by number, ``(H, W, 3)`` in [0, 1]; ``None`` after the last.
+    """
+    samples, step = list[list[np.ndarray]](), 1
+    for frame in range(SPAN):
+        if frame % step:
+            continue
+        if (views := read(frame)) is None:
+            break
+        samples.append([reduced(np.rint(view.mean(-1) * 255).astype(np.uint8)) for view in views])
+        if len(samples) == 2 * SAMPLES:
+            samples, step = samples[::2], 2 * step
+    return static_pixels([left for left, _ in samples], [right for _, right in samples])
+
+
+def _alphas(options: DepthOptions) -> list[torch.Tensor | None]:
+    """Read the pixels with an alpha above 0 of each image file; not of a file with both views."""
+    if options.both_in_one:
+        return []
+    as_stored = bool(options.calib) and is_as_stored(options.calib)
+    alphas = (read_alpha(path, name, as_stored=as_stored) for name, path in options.image_files().items())
+    return [None if alpha is None else torch.from_numpy(alpha) for alpha in alphas]

@@ -1,0 +1,1 @@
+"""Triton kernels for matching. Cost volumes are stored with planes innermost."""

@@ -1,0 +1,1 @@
+"""Images of README and the documentation: ``python -m tests.images --help``."""

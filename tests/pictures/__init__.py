@@ -1,1 +1,0 @@
-"""Pictures of README and the documentation: ``python -m tests.pictures --help``."""
