@@ -81,7 +81,7 @@ def test_of_three_quick_clicks_the_last_one_fills_form_banner_and_result(visitor
     assert name_of_result(page) == LABELS[4] and page.locator(".earlier").count() == 0
     with Image.open(EXAMPLES[4].left) as image:
         assert (scene(page)["width"], scene(page)["height"]) == image.size
-        assert page.locator("#left-note").inner_text() == "{} x {} pixels".format(*image.size)
+        page.wait_for_selector("#left-note .note >> text={} x {} pixels".format(*image.size))
     assert page.locator("#left img").get_attribute("src").endswith("left.jpg")
     assert marks(page) == [], "the points of the first result belong to it"
 
