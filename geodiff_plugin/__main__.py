@@ -1,6 +1,6 @@
-"""``python -m geodiff_plugin`` is the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``).
+"""Makes ``python -m geodiff_plugin`` the ``geodiff`` command (for ``accelerate launch`` and ``torchrun``).
 
-Layer 14: imports ``cli``.
+Layer 13: imports ``cli``.
 """
 
 from geodiff_plugin.cli.app import main

@@ -1,4 +1,4 @@
-"""``Camera``: intrinsics, image size and lens of a pinhole camera; ``View``: an image with its pose.
+"""Defines ``Camera`` (intrinsics, size and lens of a pinhole camera) and ``View`` (an image with its pose).
 
 This module contains all changes of K, all projections except of a whole left image (``geometry``), and
 the update of a z-buffer.

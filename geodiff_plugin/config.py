@@ -1,4 +1,4 @@
-"""Define all guidance parameters as one flat, frozen configuration, and its presets.
+"""Defines all guidance parameters as one flat, frozen configuration, and its presets.
 
 docs/reference/parameters.md, which is made from this module, lists which of them S5.1 and Algorithm 1 name.
 
@@ -233,8 +233,9 @@ class GuidanceConfig:
     )
     match_fits: int = _fit(
         2,
-        "Maximum number of denoising steps (or rounds of a one-step prior) with match fitting: the last one, "
-        "and the others spread over the second half of the schedule",
+        "Maximum number of match fits, each in its own denoising step (or round of a one-step prior): one in "
+        "the last step, made at full resolution with `refine_edges`, and the others spread over the second "
+        "half of the schedule",
         low=1,
         high=10_000,
         paper="-",
@@ -253,7 +254,7 @@ class GuidanceConfig:
     )
     refine_edges: bool = _fit(
         True,
-        "the result is finished at full resolution "
+        "Whether to sharpen depth edges and fit the map to the matches a last time, at full resolution "
         "([architecture](../explanation/architecture.md#edge-refinement))",
         affects=EVIDENCE,
     )

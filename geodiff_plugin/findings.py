@@ -1,4 +1,4 @@
-"""Define ``Finding``: a message for the user with a code and a severity.
+"""Defines ``Finding``: a message for the user with a code and a severity.
 
 ``FINDINGS`` lists the kinds of findings that readers and jobs report. The checks of a result declare their
 own kinds (``geodiff_plugin.trust``). docs/reference/messages.md is generated from both.

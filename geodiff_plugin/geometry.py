@@ -1,4 +1,4 @@
-"""Differentiable two-view geometry: projection, backward warping and occlusion (S7.2).
+"""Implements differentiable two-view geometry: projection, backward warping and occlusion (S7.2).
 
 Comments explain why similar functions of kornia are not used.
 

@@ -1,4 +1,4 @@
-"""Define the options that several commands, the web app and the ComfyUI node share, and check them.
+"""Defines the options that several commands, the web app and the ComfyUI node share, and checks them.
 
 An option is a ``settings.setting`` field of a dataclass. Nothing here imports torch, so ``geodiff --help``
 and option errors are immediate.

@@ -1,6 +1,6 @@
-"""Images of depth maps (S5): colours and legends, contact sheets, overviews, videos; no global state.
+"""Draws depth maps (S5): colours and legends, contact sheets, overviews, videos; no global state.
 
-Layer 3: imports ``formats`` and below; imported by ``jobs``, ``evaluation``, ``app`` and ``cli``.
+Layer 2: imports ``formats`` and below; imported by ``jobs``, ``evaluation``, ``app`` and ``cli``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Declare settings: dataclass fields with a default, help, check and effect.
+"""Declares settings: dataclass fields with a default, help, check and effect.
 
 ``GuidanceConfig`` (``config``) and the options of every command (``options``, ``jobs.options``,
 ``evaluation.options``) consist of such fields. The command line (``cli.commands``), the web app, the ComfyUI
@@ -35,7 +35,7 @@ class Affects(StrEnum):
     NOTHING = "nothing"  # stored results stay valid, up to rounding
     INPUTS = "inputs"  # the content of the files that it names
     POSES = "poses"  # the poses of a capture, and all results computed with them
-    EVIDENCE = "evidence"  # the evidence from the views (act 1), and all results computed from it
+    EVIDENCE = "evidence"  # the evidence from the views (phase 1), and all results computed from it
     RESULT = "result"  # the result
 
 

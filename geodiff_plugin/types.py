@@ -1,4 +1,4 @@
-"""Records shared by all layers.
+"""Defines records shared by all layers.
 
 Layer 0: imports ``cameras``; imported by all higher layers.
 """

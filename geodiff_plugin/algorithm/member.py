@@ -1,4 +1,4 @@
-"""``Member``: result of act 2 for one ensemble member of one image, used by act 3."""
+"""``Member``: result of phase 2 for one ensemble member of one image, used by phase 3."""
 
 from __future__ import annotations
 

@@ -248,7 +248,7 @@ class Trajectory:
         return self.metric(x, self.affine)
 
     def members(self, x: Tensor, depth_m: Tensor) -> list[Member]:
-        """Make the members for act 3 from the maps ``x`` without padding and from their ``result``."""
+        """Make the members for phase 3 from the maps ``x`` without padding and from their ``result``."""
         near_m, far_m = (end.view(-1, 1, 1, 1) for end in depth_m.flatten(1).aminmax(dim=1))
         measured = {
             "match_weight": self.match_weight,

@@ -1,6 +1,6 @@
-"""The web app, ``geodiff app``: metric depth of two images, with measurements (extra ``app``).
+"""Serves the web app, ``geodiff app``: metric depth from two images, with measurements (extra ``app``).
 
 Belongs here: the form, the page and its sessions. Functionality shared with the commands is in ``jobs``.
 To extend: a field of the form is an option of ``jobs.options`` with an entry in ``form``.
-Layer 13: imports ``jobs`` and below; nothing imports it.
+Layer 12: imports ``jobs`` and below; nothing imports it.
 """

@@ -1,7 +1,7 @@
-"""The small prior and the stereo pairs that ship with the package, for offline use.
+"""Contains the small prior and the stereo pairs that ship with the package, for offline use.
 
 Belongs here: these files and their readers. To replace the prior, see examples/training.
-Layer 9: imports ``priors``, ``formats`` and below; ``jobs``, ``app`` and ``cli`` import it.
+Layer 8: imports ``priors``, ``formats`` and below; ``jobs``, ``app`` and ``cli`` import it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Captures: many frames of one moving camera, each with metric depth, and one fused point cloud.
+"""Processes captures: many frames of one moving camera, each with metric depth, and one fused cloud.
 
 Belongs here: the frames of a capture and their neighbours, agreement between their depth maps, and fusion.
 Readers of captures are in ``formats``, solved poses in ``pose``.
-Layer 10: imports ``runtime``, ``pose`` and below; ``jobs`` and ``evaluation`` import it.
+Layer 9: imports ``runtime``, ``pose`` and below; ``jobs`` and ``evaluation`` import it.
 """
 
 #: Default maximum number of right views of a frame.

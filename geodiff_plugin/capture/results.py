@@ -42,13 +42,7 @@ from geodiff_plugin.types import DepthFrame
 #: fields of ``DepthFrame``.
 ALONE = {"depth_alone": "depth", "confidence_alone": "confidence", "sigma_alone": "sigma"}
 #: The same after the agreement check.
-AGREED = {
-    "depth": "depth",
-    "confidence": "confidence",
-    "sigma": "sigma",
-    "confirmed": "confirmed",
-    "asked": "observers",
-}
+AGREED = {name: name for name in ("depth", "confidence", "sigma", "confirmed", "observers")}
 #: Images rewritten by the agreement check.
 FIGURES = ("depth_mm.png", "sigma_mm.png", "depth.png")
 #: Number of frames that a frame is compared with.

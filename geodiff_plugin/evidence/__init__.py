@@ -1,8 +1,8 @@
-"""Act 1 for one image, before any network runs: checks the input and prepares the evidence of the views.
+"""Implements phase 1, for one image: checks the input and prepares the evidence before any network runs.
 
 Belongs here: ``inputs`` checks the input; ``prepare`` cleans and matches the views; ``pose_check`` checks and
 refines their poses; ``plan`` defines what runs concurrently. The outcome is an ``Evidence`` (paper S3.3,
 S4.2, S5.1).
-Layer 6: imports ``trust``, ``pose``, ``scale``, ``matching`` and below; imported by the other acts and
+Layer 5: imports ``trust``, ``pose``, ``scale``, ``matching`` and below; imported by the other phases and
 ``runtime``.
 """

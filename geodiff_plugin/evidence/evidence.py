@@ -1,4 +1,4 @@
-"""``Evidence``: depth information from the views and points of one image (act 1).
+"""``Evidence``: depth information from the views and points of one image (phase 1).
 
 Matches, match fits and losses use one grid of at most ``sweep_pixels``. The result has the image's size.
 """
@@ -22,8 +22,8 @@ from geodiff_plugin.types import PoseReport
 class Evidence:
     """Depth information from the views and points of one image, and the data that it was made from.
 
-    The last three fields are for act 3 and may still be computed while act 2 runs: ``EvidencePlan.complete``
-    fills them in.
+    The last three fields are for phase 3 and may still be computed while phase 2 runs:
+    ``EvidencePlan.complete`` fills them in.
     """
 
     native: PosedViews  # cleaned views of native size, with the poses in use
@@ -35,7 +35,7 @@ class Evidence:
     points_outside: int = 0  # number of user-given points outside the left image
     rows: RowMatches | None = None  # of a rectified pair, at native size
     report: PoseReport | None = None  # fit of the poses; None without a right view
-    facts: FactSheet = field(default_factory=FactSheet)  # from the checks of act 1
+    facts: FactSheet = field(default_factory=FactSheet)  # from the checks of phase 1
 
     def within(self, valid: Tensor) -> Self:
         """Set confidence to 0 where a prior is not ``valid``; points are kept if none would remain."""

@@ -1,6 +1,6 @@
-"""``GeometryGuidance``: right views, cameras, points and hyperparameters from the user (S3.3).
+"""Defines ``GeometryGuidance``: right views, cameras, points and hyperparameters from the user (S3.3).
 
-Layer 7: imports ``evidence``, and the names of terms and optimizers from ``algorithm``.
+Layer 6: imports ``evidence``, and the names of terms and optimizers from ``algorithm``.
 """
 
 from __future__ import annotations

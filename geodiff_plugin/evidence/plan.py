@@ -1,4 +1,4 @@
-"""The plan of act 1 for one image: defines what runs concurrently.
+"""The plan of phase 1 for one image: defines what runs concurrently.
 
 On CUDA the device matches the views while the CPU works in parallel:
 
@@ -9,8 +9,8 @@ On CUDA the device matches the views while the CPU works in parallel:
 3. Vertical lines of a rectified pair and, after the matches, its row matching, with their checks.
 4. If the poses fit, the rest of their check, which changes no view. If they do not, the device matches again.
 
-Steps 3 and 4 may still run during act 2: ``complete`` waits for them. On other devices both would compete for
-the same cores, so every task finishes at creation (``BackgroundTask``).
+Steps 3 and 4 may still run during phase 2: ``complete`` waits for them. On other devices both would compete
+for the same cores, so every task finishes at creation (``BackgroundTask``).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class CheckedRows(NamedTuple):
 class EvidencePlan:
     """The evidence of one image and the tasks that complete it."""
 
-    evidence: Evidence  # everything that act 2 needs
+    evidence: Evidence  # everything that phase 2 needs
     rows: BackgroundTask[CheckedRows] | None = None
     poses: BackgroundTask[CheckedPoses] | None = None
 

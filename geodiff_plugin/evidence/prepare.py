@@ -1,4 +1,4 @@
-"""Act 1: cleans the images of one scene, checks and refines their poses, and matches them (``Evidence``).
+"""Phase 1: cleans the images of one scene, checks and refines their poses, and matches them (``Evidence``).
 
 Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
 """
@@ -90,7 +90,7 @@ def _matched_during_check(
     """Plan the evidence so that the device matches the views while the CPU matches their features.
 
     The views are matched with the poses as given, since most poses fit. Downscaled images usually show that
-    they fit. Any further check then changes no view, and act 3 is the first to need its result.
+    they fit. Any further check then changes no view, and phase 3 is the first to need its result.
     """
     tasks, plan = fit_in_background(given.with_left(left_01)), None
     posed, points = given.posed_views(left_01), given.points_on(left_01.device)

@@ -15,7 +15,7 @@ What belongs here:
       ``transforms``).
     - Files themselves: opened with concise errors (``files``), written completely or not at all (``out``).
 
-Layer 3: imports ``cameras``, ``geometry`` and below; every higher package may import the names listed here.
+Layer 2: imports ``cameras``, ``geometry`` and below; every higher package may import the names listed here.
 
 To add a format, write one row, or one reader and one row: in ``CALIBRATION_FORMATS``, ``LAYOUTS``,
 ``named.DIALECTS`` or the tables of ``unread``. Add a function that writes the format to

@@ -23,7 +23,7 @@ What belongs here:
 
 A job returns records and reports to a ``notify`` callback. It prints nothing and never exits the program.
 
-Layer 11: imports ``capture``, ``streaming`` and below; ``evaluation``, ``app`` and ``cli`` import the names
+Layer 10: imports ``capture``, ``streaming`` and below; ``evaluation``, ``app`` and ``cli`` import the names
 listed here. Options and their errors need no torch.
 
 To add a job, write its options as a dataclass of settings, a function that takes them, and a ``Runner`` with

@@ -1,9 +1,9 @@
-"""Dense matching of the views for any pose, without a prior (paper S7.3).
+"""Matches the views densely for any pose, without a prior (paper S7.3).
 
 Belongs here: image cleaning, the plane sweep and its cost volume, aggregation, left-right consistency,
 reflections, row matching of rectified pairs, and known points in the form of matches.
-Layer 3: imports ``cameras``, ``geometry`` and below; imported by ``pose``, ``scale``, ``trust`` and the acts
-through the names listed here.
+Layer 2: imports ``cameras``, ``geometry`` and below; imported by ``pose``, ``scale``, ``trust`` and the
+phases through the names listed here.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Diffusion depth priors, one adapter per file; ``PRIORS`` lists them, ``find_prior`` finds one (paper S4).
+"""Adapts depth priors, one adapter per file; ``PRIORS`` lists them, ``find_prior`` finds one (paper S4).
 
 To add a prior, add a file with a ``DepthPrior`` and a row of ``PRIORS``; tests/contracts/test_priors.py picks
 it up (docs/how-to/extending.md). diffusers is imported from this layer on.
-Layer 8: imports ``evidence`` and below; imported by ``runtime``, ``bundled`` and ``jobs``. Priors have no
+Layer 7: imports ``evidence`` and below; imported by ``runtime``, ``bundled`` and ``jobs``. Priors have no
 access to cameras.
 """
 

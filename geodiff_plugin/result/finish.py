@@ -1,4 +1,4 @@
-"""Act 3 for one image: turns the maps of its ensemble into full-size depth, confidence and a verdict."""
+"""Phase 3 for one image: turns the maps of its ensemble into full-size depth, confidence and a verdict."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ def finish(
     """Compute the result of one image.
 
     Args:
-        evidence: evidence of the image, from act 1.
-        members: ensemble members, from act 2.
+        evidence: evidence of the image, from phase 1.
+        members: ensemble members, from phase 2.
         depth_m: ``(1, 1, H, W)`` metres, the reduced ensemble, at the image's or the processing size; changed
             in place.
         uncertainty: ``(1, 1, H, W)`` metres, the ensemble spread; ``None`` if not requested.

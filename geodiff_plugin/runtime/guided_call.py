@@ -232,13 +232,13 @@ class GuidedCall(_Stock):
 
 
 def _plan_evidence(guidance: GeometryGuidance, lefts_01: Tensor) -> list[EvidencePlan]:
-    """Run act 1 in float32, independent of the user's autocast."""
+    """Run phase 1 in float32, independent of the user's autocast."""
     with torch.autocast(lefts_01.device.type, enabled=False):
         return guidance.plan_evidence(lefts_01)
 
 
 def _close(plans: BackgroundTask[list[EvidencePlan]]) -> None:
-    """Wait until all work of act 1 has ended, even if its result was not needed.
+    """Wait until all work of phase 1 has ended, even if its result was not needed.
 
     The caller's stream waits as well, so that memory still being read is not reused.
     """

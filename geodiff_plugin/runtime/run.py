@@ -40,7 +40,7 @@ class GuidedRun:
         codec: the pipeline, its prior and the grid that the stock call denoises on.
         guidance: the user's guidance.
         plans: returns the evidence of every image, waiting for it if necessary.
-        call: arguments of the stock call that runs act 2; its image is a tensor on the device.
+        call: arguments of the stock call that runs phase 2; its image is a tensor on the device.
         rounds: number of guidance rounds in each denoising step.
         callback: the user's callback, which runs while the pipeline has no hooks.
     """
@@ -124,7 +124,7 @@ class GuidedRun:
         return depth_m
 
     def output(self, stock: MarigoldDepthOutput, findings: Sequence[Finding]) -> MetricDepthOutput:
-        """Run act 3 on the stock call's output, whose maps are in metres.
+        """Run phase 3 on the stock call's output, whose maps are in metres.
 
         ``findings`` concern the input; those that are reasons are added to every verdict.
         """

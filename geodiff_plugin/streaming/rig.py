@@ -1,4 +1,4 @@
-"""Prepares the frames of a rig: guidance and evidence, with poses, images and borders checked now and then.
+"""Prepares the frames of a rig: guidance and evidence, with periodic checks of poses, images and borders.
 
 The pose check takes longer than the rest of the evidence, and a rig does not change from frame to frame. It
 is made with the first frame and then with every N-th. The frames in between use its result: refined poses,

@@ -1,4 +1,4 @@
-"""Check whether a result can be trusted, and report why not.
+"""Checks whether a result can be trusted, and reports why not.
 
 "Trusted" means that no inconsistency was found. It is not a guarantee.
 
@@ -7,8 +7,8 @@ from the facts of all checks. The verdict is a function of the findings. To add 
 subclass, a line in ``registry.CHECKS`` and a test file. Contract tests and the message reference then cover
 it.
 
-Layer 5: imports ``pose``, ``matching`` and below. The acts, ``runtime`` and ``jobs`` import the names listed
-here.
+Layer 4: imports ``pose``, ``matching`` and below. The phases, ``runtime`` and ``jobs`` import the names
+listed here.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The kernels of act 3 against their references."""
+"""The kernels of phase 3 against their references."""
 
 import numpy as np
 import torch

@@ -1,6 +1,6 @@
 """Error and flicker of frames from a moving rendered rig, independent and temporally smoothed.
 
-The numbers are in docs/how-to/sequences.md.
+The numbers are in docs/appendix/results-scenes.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Captures, poses, formats and act 3 against NumPy, or against made-up captures whose metres are known."""
+"""Captures, poses, formats and phase 3 against NumPy, or against made-up captures whose metres are known."""
 
 import json
 import math

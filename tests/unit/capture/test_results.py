@@ -326,19 +326,21 @@ def test_agreement_of_finished_frames_is_written_and_its_fractions_match_the_fil
         number = NAMES.index(name)
         near = choose_neighbours(finished.solved, number, 9, [NAMES.index(other) for other in run])
         expected = agreed(alone(out, number), [alone(out, other) for other in near])
-        maps = [np.load(out / name / f"{kind}.npy") for kind in ("depth", "confidence", "confirmed", "asked")]
+        maps = [
+            np.load(out / name / f"{kind}.npy") for kind in ("depth", "confidence", "confirmed", "observers")
+        ]
         for found, values in zip(
             maps, (expected.depth, expected.confidence, expected.confirmed, expected.observers), strict=True
         ):
             np.testing.assert_array_equal(found, values)
-        _, _, confirmed, asked = maps
+        _, _, confirmed, observers = maps
         np.testing.assert_array_equal(np.load(out / name / "sigma.npy"), expected.sigma)
         sigma_mm = np.asarray(Image.open(out / name / "sigma_mm.png"))
         np.testing.assert_array_equal(sigma_mm == 0, np.isnan(expected.sigma))
         assert fractions[name]["checked_against"] == len(near) == 2
         assert fractions[name]["confirmed"] == pytest.approx(np.mean(confirmed > 0), abs=6e-5)
         assert fractions[name]["unconfirmed"] == pytest.approx(
-            np.mean((asked > 0) & (confirmed == 0)), abs=6e-5
+            np.mean((observers > 0) & (confirmed == 0)), abs=6e-5
         )
         assert all(round(fraction, 4) == fraction for fraction in fractions[name].values())
         assert 0.001 < fractions[name]["unconfirmed"] < fractions[name]["confirmed"] < 0.95
@@ -371,7 +373,7 @@ def test_depth_without_a_confidence_is_half_sure(tmp_path):
 
 
 def test_a_cleared_frame_keeps_the_files_of_others(tmp_path):
-    ours = "depth_alone confidence_alone sigma_alone depth confidence sigma confirmed asked"
+    ours = "depth_alone confidence_alone sigma_alone depth confidence sigma confirmed observers"
     for extra, left in (("notes.txt", True), (None, False)):
         folder = tmp_path / "a"
         folder.mkdir(exist_ok=True)
@@ -424,7 +426,7 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
             for depth in (temporal_smoothing[i], before[i])
         ]
         assert off[0] < 0.8 * off[1]
-        assert np.median(np.load(frame.folder / "asked.npy")[middle]) == (1 if i < 2 else 2)
+        assert np.median(np.load(frame.folder / "observers.npy")[middle]) == (1 if i < 2 else 2)
     results.write_smoothed(frames, images.__getitem__)
     for frame, depth in zip(frames, temporal_smoothing, strict=True):
         np.testing.assert_array_equal(np.load(frame.folder / "depth.npy"), depth)
@@ -444,11 +446,11 @@ def test_the_cloud_of_a_capture_is_read_by_trimesh_with_its_cameras(
     out, counts = written(finished, tmp_path, (), not_trusted)
     frames = {}
     for number, name in enumerate(NAMES):
-        depth, confidence, confirmed, asked = (
-            np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "asked")
+        depth, confidence, confirmed, observers = (
+            np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "observers")
         )
-        asked = np.ones_like(asked) if not_trusted == [name] else asked
-        frames[name] = posed_frame(name, depth, confidence, KS[number], ES[number], confirmed, asked)
+        observers = np.ones_like(observers) if not_trusted == [name] else observers
+        frames[name] = posed_frame(name, depth, confidence, KS[number], ES[number], confirmed, observers)
     cloud, normals = fuse(NAMES, frames.__getitem__, finished.image)
     read = trimesh.load(out / "cloud.ply", process=False)
     assert counts == {"cloud_points": len(cloud.points_m)}
@@ -481,7 +483,7 @@ def test_exports_are_written_on_demand_from_the_agreed_frames(finished, plain_fi
     assert (out / "colmap/sparse/points3D.txt").is_file() and not (out / "mesh.ply").exists()
     data = json.loads((out / "nerfstudio/transforms.json").read_text())
     for number, (name, entry) in enumerate(zip(NAMES, data["frames"], strict=True)):
-        maps = [np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "asked")]
+        maps = [np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "observers")]
         use = kept(posed_frame(name, *maps[:2], KS[number], ES[number], *maps[2:]))
         units = np.asarray(Image.open(out / "nerfstudio" / entry["depth_file_path"]))
         np.testing.assert_array_equal(units > 0, use)

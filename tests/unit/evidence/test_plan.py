@@ -1,4 +1,4 @@
-"""The plan of act 1: what each task is given, what completes an evidence, and what closing waits for."""
+"""The plan of phase 1: what each task is given, what completes an evidence, and what closing waits for."""
 
 from __future__ import annotations
 

@@ -69,6 +69,7 @@ def test_every_frame_is_averaged_with_its_own_camera_and_lists_its_files(run, tm
             "depth_alone.npy",
             "confidence_alone.npy",
             "confirmed.npy",
+            "observers.npy",
         } <= set(names)
 
 

@@ -899,7 +899,7 @@ def test_flow_is_used_for_few_features_next_to_the_matching_as_well(pair, monkey
 
 @END_TO_END
 def test_evidence_of_poses_that_fit_is_there_before_all_is_known_about_them(pair, monkeypatch) -> None:
-    """As on CUDA: what else the check finds is for act 3, so denoising does not wait for it."""
+    """As on CUDA: what else the check finds is for phase 3, so denoising does not wait for it."""
     asked = threading.Event()
 
     hold_until(asked, prepare, "check_poses", monkeypatch)

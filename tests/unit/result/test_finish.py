@@ -1,4 +1,4 @@
-"""Act 3 of one image: which map each stage gets, the spread of an ensemble, and every field of the result."""
+"""Phase 3 of one image: the map each stage gets, the spread of an ensemble, and every field of the result."""
 
 import math
 from dataclasses import FrozenInstanceError, replace
@@ -217,7 +217,7 @@ def test_every_field_is_made_of_its_own_stage(far_m, ratio):
     assert seen.call is options.call and doubt in found.verdict.reasons
     assert (seen[KnownPoints].count, seen[KnownPoints].outside) == (90, 4)
     for check in (*of_poses.as_record(), Letterbox.name()):
-        assert seen.as_record()[check] == evidence.facts.as_record()[check], "the facts of act 1 are kept"
+        assert seen.as_record()[check] == evidence.facts.as_record()[check], "the facts of phase 1 are kept"
     assert found.evidence is evidence and len({found}) == 1
     for record, field in ((found, "depth_m"), (options, "config")):
         with pytest.raises(FrozenInstanceError):
