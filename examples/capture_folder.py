@@ -4,7 +4,7 @@ Takes a phone scan (transforms.json), a COLMAP model or any other layout support
 By default it renders a scene from a moving camera, with pose errors typical of a tracker, and prints the
 error of the depth. Needs the extra `capture`. Runs offline:
 
-    python -m examples.capture_folder [scan/ --frames 0:100:10]
+    python -m examples.capture_folder [scan/ --frames 0::10]
 """
 
 from __future__ import annotations

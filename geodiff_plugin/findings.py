@@ -382,7 +382,7 @@ _KINDS = (
     FindingKind(
         "capture.images-found",
         WARNING,
-        "Images were found in another folder than the camera file states",
+        "Images were found in a different folder from the one in the camera file",
         cause="The usual folders do not hold the images, but a nearby folder has files with the same names.",
         hint="Check that they are the right images; if not, give their folder (--images).",
     ),
@@ -391,15 +391,16 @@ _KINDS = (
         WARNING,
         "Masks of the capture are used",
         cause="The file names masks (mask_path), or a folder masks is next to the images, as for COLMAP.",
-        hint="If the masks mark something else, such as one object, move the folder, or give one white mask "
-        "(--mask).",
+        hint="If the masks mark something else, such as one object, move their folder, or pass an all-white "
+        "mask (--mask) to ignore them.",
     ),
     FindingKind(
         "image.overlays",
         WARNING,
-        "A part of the image is static",
-        cause="Text or a logo is burnt into the frames, or a part of the rig is visible.",
-        hint="If it shows the scene, give one white mask (--mask) and report it.",
+        "Part of the image is static",
+        cause="Text or a logo is burnt into the frames, or part of the rig is visible.",
+        hint="These pixels get no depth. If they show the scene, pass an all-white mask (--mask) to keep "
+        "them.",
     ),
     FindingKind(
         "capture.no-mask",
@@ -426,7 +427,7 @@ _KINDS = (
         "capture.size-mismatch",
         REASON,
         "The image sizes differ slightly from the calibrated sizes",
-        cause="The images are the ones before undistortion, or come from another export.",
+        cause="The images have not been undistorted, or come from another export.",
         hint="Give the folder of the matching images (--images), or the model of these images.",
     ),
     FindingKind(
@@ -434,8 +435,8 @@ _KINDS = (
         WARNING,
         "The unit of a transforms.json is assumed to be metres",
         cause="The file states no unit and has no depth maps. Devices that record depth maps use metres.",
-        hint="If its poses were estimated from the images, or it was rendered in another unit, give a length "
-        "(--known-length, --distance, --metres-per-unit).",
+        hint="If the poses were estimated from images, or the scene was rendered in another unit, give a "
+        "length (--known-length, --distance, --metres-per-unit).",
     ),
     FindingKind(
         "capture.gps-scale",
@@ -468,10 +469,10 @@ _KINDS = (
     FindingKind(
         "capture.trajectory-times",
         WARNING,
-        "Many frames have no pose at their time",
-        cause="The trajectory starts at another moment than the video, or has other times than its frames.",
-        hint="Shift the times so that 0 is the first frame. Phones record at a variable rate: use the times "
-        "in the container, not the frame number divided by the rate.",
+        "Many frames have no pose with a matching timestamp",
+        cause="The trajectory and the video start at different times, or their timestamps do not match.",
+        hint="Shift the timestamps so that the first frame is at 0. Phones record at a variable rate, so use "
+        "the container's timestamps, not frame number / frame rate.",
     ),
     FindingKind(
         "capture.blurred",
@@ -490,7 +491,7 @@ _KINDS = (
     FindingKind(
         "capture.convention",
         WARNING,
-        "The poses are read in another convention than the file declares",
+        "The poses are read in a different convention from the declared one",
         cause="The matches contradict the declared convention.",
         hint="Check that the convention in the message is the right one.",
     ),
@@ -505,8 +506,8 @@ _KINDS = (
         "capture.rotated",
         REASON,
         "The images are rotated relative to their cameras",
-        cause="The images were rotated later, or are stored in another orientation than the poses and K "
-        "assume.",
+        cause="The images were rotated afterwards, or their stored orientation is not the one that the poses "
+        "and K assume.",
         hint="Rotate the images as the message describes, or give poses and K of the images as stored.",
     ),
     FindingKind(
@@ -526,8 +527,8 @@ _KINDS = (
     FindingKind(
         "capture.scales",
         WARNING,
-        "Positions and depth maps give different scales",
-        cause="The tracker's lengths are inaccurate.",
+        "Camera positions and depth maps give different scales",
+        cause="The tracked camera positions are inaccurate.",
         hint="Give a known length (--known-length).",
     ),
     FindingKind(
@@ -585,14 +586,15 @@ _KINDS = (
         "pairs.side-by-side",
         WARNING,
         "One image or video holds both views",
-        cause="--side-by-side is given without a layout, or only one video.",
-        hint="Give another layout if the message is wrong, or both videos if one holds only the left view.",
+        cause="--side-by-side was given without a layout, or only one video was given.",
+        hint="Give the layout if the inferred one is wrong, or pass both videos if this one contains only "
+        "the left view.",
     ),
     FindingKind(
         "pairs.layout",
         ASSUMPTION,
         "The layout of an image or video that holds both views is assumed",
-        cause="No layout is given, and shape and content leave it open.",
+        cause="No layout was given, and the image's shape and content are inconclusive.",
         hint="Give it (--side-by-side full, half, over-under or half-over-under). A wrong one may scale the "
         "depth by 2 or 0.5.",
     ),

@@ -204,7 +204,8 @@ class RunOptions(PriorOptions):
     )
     ensemble: int = _prior(
         1,
-        "Number of predictions with different noise; the spread of two or more is the uncertainty.",
+        "Number of predictions with different noise; if two or more, their spread is written as the "
+        "uncertainty.",
         low=1,
         high=1000,
     )
@@ -218,7 +219,7 @@ class RunOptions(PriorOptions):
     far: float | None = _guidance(None, "Farthest depth to search, in metres.", above_0="metres")
     preset: str = _guidance(
         "default",
-        "Preset: default, fast (coarser matches, given poses) or paper (Algorithm 1).",
+        "Preset: default, fast (coarser matches, poses used as given) or paper (Algorithm 1).",
         choices=PRESETS,
     )
     parameter: tuple[str, ...] = _guidance(

@@ -53,7 +53,7 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Save the image upright.",
     ),
     "image.overlays": (
-        "A part of the image does not move with the scene, such as text or a logo.",
+        "Part of the image does not move with the scene, such as text or a logo.",
         "Use images without it, if it covers what you measure.",
     ),
     "camera.from-exif": (
@@ -181,13 +181,13 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "The images do not fit together.",
         f"Check that both show the same scene. {_CALIBRATION}",
     ),
-    "views.blocked": ("A part of one image shows nothing.", "Uncover the lens, and take that image again."),
+    "views.blocked": ("Part of one image is blank.", "Uncover the lens, and take that image again."),
     "views.repeated-pattern": (
         "Part of the image is a repeated pattern, such as bars or tiles.",
         "Do not measure on it where the confidence is low.",
     ),
     "depth.repeated-pattern": (
-        "A repeated pattern fits several depths, so its depth is undecided.",
+        "A repeated pattern fits several depths, so its depth is ambiguous.",
         "Take images that show more than the pattern, or with a shorter distance between the cameras.",
     ),
     "views.letterbox": (

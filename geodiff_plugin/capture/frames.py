@@ -91,7 +91,7 @@ class Capture:
         If it has no intrinsics, pass ``K (3, 3)`` in pixels or a horizontal field of view in degrees;
         ``trajectory`` is the trajectory of a video in TUM format. ``images`` is the folder of the images
         named by a file of cameras, if they are not next to it, or if there are several copies. ``mask`` is a
-        folder with the mask of each frame, or one mask of all frames, white where pixels are valid; by
+        folder with the mask of each frame, or one mask for all frames, white where pixels are valid; by
         default the capture's own masks (``masks/`` for COLMAP, ``mask_path`` for nerfstudio).
 
         Raises:

@@ -204,7 +204,7 @@ COMMANDS = {
     "live": Command(
         LiveOptions,
         _live,
-        "Estimate metric depth of a stereo camera, a video or a stream, frame by frame.\n\n"
+        "Estimate metric depth from a stereo camera, a video or a stream, frame by frame.\n\n"
         "For example: geodiff live --source 0 --side-by-side --calib calib.txt",
     ),
     "demo": Command(_Demo, _Demo.run, "Run on the bundled pair with ground truth, or on real pairs."),

@@ -237,7 +237,7 @@ class CaptureEvalOptions(EvalOptions):
 
     data: tuple[Path, ...] = folder_of("Captures with ground-truth depth maps.", "", default=MISSING)
     frames: str | None = setting(
-        None, "Frames: NAME,NAME or FIRST:LAST:STEP (default: all).", section=SAMPLES
+        None, "Frames: NAME,NAME or FIRST:LAST:STEP, LAST included (default: all).", section=SAMPLES
     )
     count: int | None = count_of(
         None, "Number of evenly spaced frames of each capture, instead of --frames.", 2

@@ -143,7 +143,7 @@ def read_capture(
     ``K`` and ``fov`` (horizontal, degrees) are for layouts without intrinsics, and override the files'.
     ``trajectory`` has lines ``seconds tx ty tz qx qy qz qw`` of a video, camera-to-world, OpenCV's axes.
     ``images`` is a folder that contains the images, possibly in subfolders. ``mask`` is a folder with the
-    mask of each frame, or one mask of all frames (default: the masks in the capture).
+    mask of each frame, or one mask for all frames (default: the masks in the capture).
     """
     source = Path(path)
     if not os.path.exists(source):

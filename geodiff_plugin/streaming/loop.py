@@ -89,7 +89,8 @@ def live(
             of them, or an iterable of ``StereoFrame`` or ``(left, right)``. It is read in its own thread.
         rig: calibration of the two cameras, from ``read_calibration``; lens distortion is removed. Or a
             function that makes the setup of the rig from its first frame.
-        preset: hyperparameters, as in ``GeometryGuidance``.
+        preset: hyperparameters, as in ``GeometryGuidance``, except ``pose``, which follows from
+            ``check_every``.
         config: hyperparameters in place of a preset.
         mask: valid pixels of the left images, as in ``GeometryGuidance``; ignored if ``rig`` is a function.
         right_mask: the same for the right images.

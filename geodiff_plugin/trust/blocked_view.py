@@ -1,4 +1,4 @@
-"""Check whether a part of one view is blank and the other view is not: a thumb or a cap at the lens."""
+"""Check whether part of one view is blank and the other view is not: a thumb or a cap at the lens."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from geodiff_plugin.trust.stages import ImagesStage
 BLOCKED = FindingKind(
     "views.blocked",
     REASON,
-    "A part of one view shows nothing",
-    cause="Something at the lens, such as a finger, a cap or dirt, covers a part of one camera's image.",
-    hint="Clean or uncover the lens, or mask what it does not see in both views (--mask, --right-mask).",
+    "Part of one view is blank",
+    cause="A finger, a lens cap or dirt on the lens covers part of one camera's image.",
+    hint="Clean or uncover the lens, or mask the blocked region in both views (--mask, --right-mask).",
 )
 
 #: Images are downscaled by this factor.
@@ -44,7 +44,7 @@ class BlankRegions:
 class BlockedView(Check[BlankRegions]):
     """Detects blank or masked regions at the border of one view that are much larger than in the other view.
 
-    Walls and skies are blank in both views. Where one view shows nothing, depth is not measured, and matches
+    Walls and skies are blank in both views. Where only one view is blank, depth is not measured, and matches
     at the edge of the region may be wrong.
     """
 
@@ -73,8 +73,8 @@ class BlockedView(Check[BlankRegions]):
         yield Finding(
             BLOCKED,
             f"{100 * high:.0f} % of the {blank} is blank or masked at its border, but {100 * low:.0f} % of "
-            f"the {other}, so depth is not measured there. Uncover the lens, or mask what it does not see in "
-            "both images.",
+            f"the {other}, so depth is not measured there. Uncover the lens, or mask that region in both "
+            "images.",
         )
 
 

@@ -19,8 +19,8 @@ DISTORTED = FindingKind(
     "views.distorted",
     REASON,
     "The images have residual lens distortion",
-    cause="The images are raw and the calibration lacks their distortion coefficients, or they are rectified "
-    "and the calibration has them.",
+    cause="The images are raw but the calibration has no distortion coefficients, or they are rectified but "
+    "it has some.",
     hint="Give rectified images, or raw images with a calibration that has the distortion coefficients.",
 )
 RESIDUAL_TREND = FindingKind(

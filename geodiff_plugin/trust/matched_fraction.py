@@ -15,7 +15,7 @@ OVERLAP = FindingKind(
     "views.overlap",
     WARNING,
     "The views have little overlap",
-    cause="Only a small fraction of the left image is visible to a right camera.",
+    cause="Only a small fraction of the left image is visible in a right view.",
     hint="Choose views with an overlap of at least half of the image.",
 )
 
@@ -69,6 +69,6 @@ class MatchedFraction(Check[Matched]):
         if fact and fact.visible is not None and fact.visible < cls.MIN_VISIBLE:
             yield Finding(
                 OVERLAP,
-                f"Only {fact.visible:.0%} of the left image is visible to a right camera, so the scale is "
+                f"Only {fact.visible:.0%} of the left image is visible in a right view, so the scale is "
                 "poorly constrained. Increase the overlap.",
             )

@@ -25,8 +25,8 @@ FAR_OCCLUDES = FindingKind(
     "depth.occlusion",
     REASON,
     "The occlusion order is inverted",
-    cause="Left and right are swapped, or both images are mirrored or upside down, and the principal points "
-    "of the cameras differ.",
+    cause="The cameras have different principal points, and the views are swapped or both are mirrored or "
+    "upside down.",
     hint="Swap the images, or restore their original orientation.",
 )
 

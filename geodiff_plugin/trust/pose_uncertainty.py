@@ -17,7 +17,7 @@ SCALE = FindingKind(
     "scale.uncertain",
     REASON,
     "The scale of the refined pose is uncertain",
-    cause="The baseline contradicts the depth of the scene under the given pose.",
+    cause="The baseline was not measured, and it contradicts the scene depth under the given pose.",
     hint="Give the measured baseline (--baseline, measured_baseline=True), or at least three known points.",
 )
 UNCONSTRAINED = FindingKind(

@@ -18,16 +18,16 @@ REPEATED = FindingKind(
     REMARK,
     "Part of the image is a repeated pattern",
     cause="A fence, bars, tiles, blinds or shelves look the same one period further along the epipolar line.",
-    hint="Use the confidence there, or turn the baseline out of the direction of the repetition.",
+    hint="Filter by confidence there, or rotate the rig so that the baseline is not along the repetition.",
 )
 UNDECIDED = FindingKind(
     "depth.repeated-pattern",
     REASON,
-    "A repeated pattern leaves the depth undecided",
+    "A repeated pattern makes the depth ambiguous",
     cause="The pattern matches at several depths, and neither the prior nor the surroundings decide which is "
     "right.",
-    hint="Turn the baseline out of the direction of the repetition, show more of the scene without the "
-    "pattern, use a better prior, or give known points.",
+    hint="Rotate the rig so that the baseline is not along the repetition, show more of the scene without "
+    "the pattern, use a better prior, or give known points.",
 )
 
 
@@ -77,11 +77,11 @@ class RepeatedPattern(Check[Repetition]):
             yield Finding(
                 UNDECIDED,
                 f"{100 * fact.undecided:.0f} % of the image is a repeated pattern that matches at several "
-                "depths, so its depth may be off by whole periods. Turn the baseline, or give known points.",
+                "depths, so its depth may be off by whole periods. Rotate the rig, or give known points.",
             )
         elif fact.fraction > cls.MIN_FRACTION:
             yield Finding(
                 REPEATED,
                 f"{100 * fact.fraction:.0f} % of the image is a repeated pattern. The prior and the "
-                "surroundings chose its depth, which is less certain. Use the confidence there.",
+                "surroundings chose its depth, which is less certain. Filter by confidence there.",
             )

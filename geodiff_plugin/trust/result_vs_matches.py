@@ -19,7 +19,7 @@ OFF = FindingKind(
     REASON,
     "The depth differs from the matched depths",
     cause="The scale or shift was not found.",
-    hint="Leave match fitting and gradient updates on, use another prior, or give known points.",
+    hint="Do not disable match fitting (fit_matches). Otherwise use another prior, or give known points.",
 )
 
 

@@ -40,6 +40,12 @@ def test_help_of_depth_begins_with_what_is_given_most_and_has_every_option(capsy
         assert len(re.findall(rf"^  (?:{flag})(?=\s)", text, re.MULTILINE)) == 1, flag
 
 
+def test_help_of_live_describes_its_own_inputs_and_poses(capsys, monkeypatch):
+    """It has neither LEFT nor RIGHT, and refines poses with every preset."""
+    text = _help(["live"], 80, capsys, monkeypatch)
+    assert not re.search(r"\b(LEFT|RIGHT)\b", text) and "as given" not in text
+
+
 def test_defaults_of_lists_follow_the_sentence(capsys, monkeypatch):
     sentence = " ".join(_help(["eval", "pairs"], 80, capsys, monkeypatch).split())
     assert "shows them. [default: prior-aligned, search-only, paper, guided, sgbm]" in sentence

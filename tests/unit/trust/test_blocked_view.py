@@ -1,4 +1,4 @@
-"""A part of one view that shows nothing is found; walls and skies are in both views."""
+"""A blank part of one view is found; walls and skies are in both views."""
 
 import cv2
 import numpy as np
