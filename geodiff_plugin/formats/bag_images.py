@@ -26,6 +26,8 @@ CODED = (
     "theora_image_transport/Packet",
     "theora_image_transport/msg/Packet",
 )
+#: Parts of the names of video codecs in the ``format`` of a compressed image.
+CODECS = ("264", "265", "hevc")
 DECODE_CODED = "Republish them as raw images and record those: ros2 run image_transport republish ffmpeg raw."
 
 
@@ -66,40 +68,56 @@ def _encodings() -> dict[str, Encoding]:
     return table
 
 
-#: Encodings by name in a message, in any letter case.
+#: Encodings by name in a message.
 ENCODINGS = _encodings()
+#: The same by lower-case name: drivers differ in letter case.
+ENCODINGS_BY_LOWER_NAME = {name.lower(): encoding for name, encoding in ENCODINGS.items()}
 
 
 def decode_image(message: Any, path: Path) -> np.ndarray:
-    """Return an ``Image`` or ``CompressedImage`` as ``(H, W, 3)``, RGB, in its own dtype."""
+    """Return an ``Image`` or ``CompressedImage`` as ``(H, W, 3)``, RGB, in its own dtype.
+
+    Raises:
+        InputError: an unsupported encoding, or data that is truncated or does not match its encoding.
+    """
     data = np.asarray(message.data, dtype=np.uint8)
-    if hasattr(message, "format"):
+    decode = _decode_compressed if hasattr(message, "format") else _decode_raw
+    return decode(message, data, path)
+
+
+def _decode_compressed(message: Any, data: np.ndarray, path: Path) -> np.ndarray:
+    try:
         image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-        if image is None:
-            hint = (
-                DECODE_CODED if any(word in message.format.lower() for word in ("264", "265", "hevc")) else ""
-            )
-            raise InputFileError(f"an image of {path} ({message.format}) cannot be decoded. {hint}".rstrip())
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    by_small = {name.lower(): encoding for name, encoding in ENCODINGS.items()}
-    encoding = by_small.get(str(message.encoding).lower())
+    except cv2.error:  # no data, or a header with a huge size; other damage returns None
+        image = None
+    if image is None:
+        is_video = any(word in message.format.lower() for word in CODECS)
+        hint = f" {DECODE_CODED}" if is_video else ""
+        raise InputFileError(f"an image of {path} ({message.format}) cannot be decoded.{hint}")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _decode_raw(message: Any, data: np.ndarray, path: Path) -> np.ndarray:
+    encoding = ENCODINGS_BY_LOWER_NAME.get(str(message.encoding).lower())
     if encoding is None:
         bad_value("the encoding", f"one of {', '.join(ENCODINGS)}", f"{message.encoding} in {path}")
-    numbers = np.dtype((">" if message.is_bigendian else "<") + encoding.kind)
+    size = f"{message.width}x{message.height} in {path}"
+    if not (message.width and message.height):
+        bad_value("an image", "of at least one pixel", size)
+    stored = np.dtype((">" if message.is_bigendian else "<") + encoding.kind)
     height = round(message.height * encoding.rows)
-    used = message.width * encoding.channels * numbers.itemsize
-    if message.step < used or data.size < height * message.step:
-        expected = f"{height} rows of {used} bytes ({message.encoding})"
-        bad_value(
-            "an image",
-            expected,
-            f"{data.size} bytes, rows of {message.step}, in {path}",
-            "It may be truncated.",
-        )
-    rows = data[: height * message.step].reshape(height, message.step)[:, :used]
-    image = np.ascontiguousarray(rows).view(numbers).astype(encoding.kind)
+    row_bytes = message.width * encoding.channels * stored.itemsize
+    if message.step < row_bytes or data.size < height * message.step:
+        expected = f"{height} rows of {row_bytes} bytes ({message.encoding})"
+        got = f"{data.size} bytes, rows of {message.step}, in {path}"
+        bad_value("an image", expected, got, "It may be truncated.")
+    rows = data[: height * message.step].reshape(height, message.step)[:, :row_bytes]
+    image = np.ascontiguousarray(rows).view(stored).astype(encoding.kind)
     image = image.reshape(height, message.width, encoding.channels)
-    return image if encoding.code is None else cv2.cvtColor(image, encoding.code)
+    try:
+        return image if encoding.code is None else cv2.cvtColor(image, encoding.code)
+    except cv2.error:  # an odd width or height, although two pixels share one colour
+        bad_value("an image", f"of even width and height ({message.encoding})", size)
 
 
 def both_as_01(images: Sequence[np.ndarray], path: Path) -> list[np.ndarray]:

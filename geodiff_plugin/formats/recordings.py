@@ -47,6 +47,10 @@ def _open_video(path: Path, name: str) -> cv2.VideoCapture:
     return capture
 
 
+class EndOfRecordingError(InputFileError):
+    """A frame after the last one of a video or bag."""
+
+
 class VideoFacts(NamedTuple):
     """Number, rate, size and times of a video's frames."""
 
@@ -112,7 +116,8 @@ class VideoReader(AbstractContextManager["VideoReader"]):
             self._next += 1
         read, image = self._capture.read() if self._next == frame else (False, None)
         if not read:
-            raise InputFileError(f"frame {frame} of {self._path} cannot be decoded.")
+            # OpenCV does not distinguish the end of a video from damage.
+            raise EndOfRecordingError(f"frame {frame} of {self._path} cannot be decoded.")
         self._next += 1
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255.0
 
@@ -232,7 +237,7 @@ class BagReader(AbstractContextManager["BagReader"]):
     def read(self, frame: int) -> np.ndarray:
         """Read a pair, ``(H, 2 W, 3)`` float32 in [0, 1], RGB, left view first."""
         if frame >= len(self._pairs):
-            raise InputFileError(f"{self._path} has no pair {frame}.")
+            raise EndOfRecordingError(f"{self._path} has no pair {frame}.")
         images = [self._image(*each) for each in zip(self._connections, self._pairs[frame], strict=True)]
         if images[0].shape != images[1].shape:
             sizes = " and ".join("{1}x{0}".format(*image.shape) for image in images)
@@ -243,7 +248,12 @@ class BagReader(AbstractContextManager["BagReader"]):
         at = stamp.recorded_ns
         for connection, _, raw in self._reader.messages(connections, at, at + 1):
             if _header_ns(self._reader, raw) == stamp.header_ns:
-                return decode_image(self._reader.deserialize(raw, connection.msgtype), self._path)
+                try:
+                    message = self._reader.deserialize(raw, connection.msgtype)
+                except Exception as error:  # any error that a damaged message may cause
+                    reason = str(error).partition("\n")[0] or type(error).__name__
+                    raise InputFileError(f"a message of {self._path} cannot be read ({reason}).") from None
+                return decode_image(message, self._path)
         raise InputFileError(f"the image of {stamp.header_ns} ns in {self._path} cannot be read.")
 
 

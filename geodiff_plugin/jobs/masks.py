@@ -49,7 +49,8 @@ def read_masks(
 def find_overlays(read: Callable[[int], Sequence[np.ndarray] | None]) -> np.ndarray | None:
     """Find ``static_pixels`` of a video of a rig.
 
-    ``read`` returns both views of a frame by number, ``(H, W, 3)`` in [0, 1]; ``None`` after the last.
+    ``read`` returns both views of a frame by number, ``(H, W, 3)`` in [0, 1]; ``None`` after the last, and
+    an empty sequence for a damaged frame.
     """
     samples, step = list[list[np.ndarray]](), 1
     for frame in range(SPAN):
@@ -57,6 +58,8 @@ def find_overlays(read: Callable[[int], Sequence[np.ndarray] | None]) -> np.ndar
             continue
         if (views := read(frame)) is None:
             break
+        if not views:
+            continue
         samples.append([reduced(np.rint(view.mean(-1) * 255).astype(np.uint8)) for view in views])
         if len(samples) == 2 * SAMPLES:
             samples, step = samples[::2], 2 * step

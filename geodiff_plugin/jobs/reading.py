@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from geodiff_plugin._internal.camera_checks import check_intrinsics_fit
-from geodiff_plugin._internal.checks import InputFileError, UnknownPoseError, bad_value, warn, with_code
+from geodiff_plugin._internal.checks import InputError, UnknownPoseError, bad_value, warn, with_code
 from geodiff_plugin.evidence.guidance import GeometryGuidance, assumed_centre
 from geodiff_plugin.evidence.prepare import pinhole
 from geodiff_plugin.evidence.unposed import focal_source
@@ -268,11 +268,16 @@ class PairReader:
         return self._overlays[ref.left]
 
     def _frame_of(self, ref: PairRef, frame: int) -> Sequence[np.ndarray] | None:
-        """Return both views of another frame of the same video or bag; ``None`` after its end."""
+        """Return both views of another frame of the same video or bag.
+
+        Returns ``None`` after the last frame, and no views for a damaged one, which ``find_overlays`` skips.
+        """
         right = ref.right_frame
         if right is not None:
             right = max(0, right + frame - (ref.frame or 0))
         try:
             return self.frames_of(replace(ref, frame=frame, right_frame=right))
-        except InputFileError:
+        except recordings.EndOfRecordingError:
             return None
+        except InputError:
+            return ()

@@ -1,5 +1,7 @@
 """Images of bags: every encoding by its own colours and bytes, and the scale of both views of a pair."""
 
+import struct
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -115,6 +117,35 @@ def test_a_truncated_image_is_rejected():
     np.testing.assert_array_equal(decode_image(longer, PATH), values)
     with pytest.raises(InputError, match=r"the encoding must be one of uyvy, .*; got jpegxl in drive\.mcap"):
         decode_image(message("jpegxl", values), PATH)
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono16", "nv12", "uyvy"])
+def test_an_image_without_pixels_is_rejected(encoding):
+    given = message(encoding, np.zeros((4, 4, 3), np.uint8), height=0, width=0)
+    with pytest.raises(InputError, match=r"an image must be of at least one pixel; got 0x0 in drive\.mcap"):
+        decode_image(given, PATH)
+
+
+@pytest.mark.parametrize(("encoding", "width", "height"), [("nv12", 5, 5), ("nv21", 6, 5), ("uyvy", 5, 4)])
+def test_subsampled_colours_need_an_even_size(encoding, width, height):
+    given = message(encoding, np.zeros((9, 12), np.uint8), width=width, height=height)
+    expected = rf"of even width and height \({encoding}\); got {width}x{height} in drive\.mcap"
+    with pytest.raises(InputError, match=expected):
+        decode_image(given, PATH)
+
+
+def huge_png() -> bytes:
+    """A PNG whose header states more pixels than OpenCV reads."""
+    data = cv2.imencode(".png", np.zeros((2, 2), np.uint8))[1].tobytes()
+    header = data[12:16] + struct.pack(">II", 1 << 20, 1 << 20) + data[24:29]
+    return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", huge_png()], ids=["empty", "cut", "huge"])
+def test_a_damaged_compressed_image_is_rejected(data):
+    given = SimpleNamespace(format="jpeg", data=np.frombuffer(data, np.uint8))
+    with pytest.raises(InputFileError, match=r"an image of drive\.mcap \(jpeg\) cannot be decoded\.\Z"):
+        decode_image(given, PATH)
 
 
 def test_compressed_images_keep_their_bits_and_their_order_of_colours():

@@ -13,6 +13,7 @@ from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.recordings import (
     BagFrame,
     BagReader,
+    EndOfRecordingError,
     Stamp,
     VideoReader,
     is_bag,
@@ -60,7 +61,7 @@ def test_frames_are_read_by_their_number_in_any_order(video):
         red, green = image[..., 0], image[..., 1]
         assert red[:, -8:].mean() > red[:, :8].mean() + 0.3 and green[-8:].mean() > green[:8].mean() + 0.3
         for number in (12, 20):
-            with pytest.raises(InputFileError, match=rf"frame {number} of .* cannot be decoded"):
+            with pytest.raises(EndOfRecordingError, match=rf"frame {number} of .* cannot be decoded"):
                 reader.read(number)
         assert shade(reader.read(5)) == 5
 
@@ -176,6 +177,21 @@ def test_both_images_of_a_pair_must_be_of_one_size(tmp_path):
         pytest.raises(InputFileError, match="have equal sizes; got 6x4 and 8x5"),
     ):
         reader.read(0)
+
+
+def test_a_frame_after_the_last_is_distinguished_from_a_damaged_one(tmp_path, monkeypatch):
+    path = bag(tmp_path / "a.mcap", {topic: [(0, 0), (10, 10)] for topic in TOPICS})
+
+    def fails(reader, raw, kind):
+        raise AssertionError
+
+    with BagReader(path, TOPICS, 0.001) as reader:
+        with pytest.raises(EndOfRecordingError, match="has no pair 2"):
+            reader.read(2)
+        monkeypatch.setattr(AnyReader, "deserialize", fails)  # as it does if a message is too short
+        with pytest.raises(InputFileError, match="a message of .* cannot be read .AssertionError.") as caught:
+            reader.read(1)
+        assert not isinstance(caught.value, EndOfRecordingError)
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".bag"])

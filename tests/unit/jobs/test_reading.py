@@ -1,5 +1,6 @@
 """The files of a pair become images and a guidance: each view with its own image, camera and pose."""
 
+import contextlib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin._internal.checks import InputError, UnknownPoseError
+from geodiff_plugin._internal.checks import InputError, InputFileError, UnknownPoseError
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.findings import Finding
 from geodiff_plugin.jobs import reading
@@ -19,6 +20,7 @@ from geodiff_plugin.jobs.pairs import PairRef
 from geodiff_plugin.jobs.reading import read_pair
 from tests.unit.formats.test_frame_packing import packed
 from tests.unit.jobs.pair_files import BARE, ES, KS, LENSES, NAMES, NUMBERS, SIZES, image_of, options
+from tests.unit.jobs.test_masks import rig_video
 
 
 def test_every_view_has_its_own_image_camera_and_pose(files):
@@ -260,6 +262,29 @@ def test_videos_and_bags_are_opened_once_and_closed(monkeypatch):
     assert opened[-1] == (Path("side.mcap"), ("/l", "/r"), 0.25)
     made.close()
     assert {"l.mp4 closed", "r.mp4 closed", "side.mp4 closed", "side.mcap closed"} <= set(map(str, opened))
+
+
+def test_damaged_frames_do_not_keep_a_bag_from_having_overlays(monkeypatch):
+    """Overlays are sought for every pair, so an error would fail all pairs of the bag."""
+    views_of = rig_video("12:34 REC")
+    damaged = {1: InputError("an image must be 6 rows"), 6: InputFileError("an image cannot be decoded")}
+
+    class Reader(contextlib.nullcontext):
+        def __init__(self, path, topics, tolerance):
+            super().__init__(self)
+
+        def read(self, frame):
+            if frame in damaged:
+                raise damaged[frame]
+            if (views := views_of(frame)) is None:
+                raise reading.recordings.EndOfRecordingError("no such pair")
+            return np.hstack(views)
+
+    monkeypatch.setattr(reading.recordings, "BagReader", Reader)
+    given = DepthOptions(left=Path("drive.mcap"), topic_left="/l", topic_right="/r")
+    with reading.PairReader(given) as reader:
+        overlays = reader._overlays_of(PairRef("000001", given.left, None, frame=1))
+    assert overlays is not None and overlays[16:30, 14:120].mean() > 0.8
 
 
 def test_a_pair_of_many_is_read_with_its_origin(files, monkeypatch):
