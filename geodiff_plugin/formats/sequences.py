@@ -230,13 +230,19 @@ def _timed_names(file: Path) -> list[tuple[float, str]]:
 
 def _associated_names(file: Path) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
     """Return images and depth maps with their times from lines with one of each, in either order."""
+    first, second = list[tuple[float, str]](), list[tuple[float, str]]()
     with reading_file(file, "list of seconds and file names, twice per line"):
-        rows = [row[:4] for row in _below_heading(read_rows(file, f"{file}", "seconds and file names"))]
-        lines = [[word.replace("\\", "/") for word in row] for row in rows]
-        pairs = [((float(t), name), (float(s), other)) for t, name, s, other in lines]
-    depth_first = any(Path(name).parent.name.startswith("depth") for (_, name), _ in pairs)
-    first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+        for row in _below_heading(read_rows(file, f"{file}", "seconds and file names")):
+            t, name, other_t, other_name = (word.replace("\\", "/") for word in row[:4])
+            first.append((float(t), name))
+            second.append((float(other_t), other_name))
+    depth_first = _depth_mentions(first) > _depth_mentions(second)
     return (second, first) if depth_first else (first, second)
+
+
+def _depth_mentions(files: Sequence[tuple[float, str]]) -> int:
+    """Count the word "depth" in paths: paths of depth maps have it more often than paths of images."""
+    return sum(name.lower().count("depth") for _, name in files)
 
 
 def read_trajectory(file: Path) -> TimedPoses:

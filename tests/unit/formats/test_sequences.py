@@ -254,6 +254,27 @@ def test_tum_associations_pair_images_with_depth_maps(tmp_path, name, depth_firs
     assert_poses_near(layout)
 
 
+@pytest.mark.parametrize(
+    ("image", "depth"),
+    [
+        ("rgb/1.png", "depth/1.png"),
+        ("rgb/sub/1.png", "depth/sub/1.png"),
+        ("color/1.png", "aligned_depth/1.png"),
+        ("color/1.png", "Aligned_Depth_to_color/1.png"),
+        ("depth_data/rgb/1.png", "depth_data/depth/1.png"),
+        ("1.png", "1_depth.png"),
+    ],
+)
+@pytest.mark.parametrize("depth_first", [False, True])
+def test_associated_depth_maps_are_recognised_by_their_paths(tmp_path, image, depth, depth_first):
+    names = (depth, image) if depth_first else (image, depth)
+    (tmp_path / "associations.txt").write_text("1.0 {} 1.5 {}\n2.0 {} 2.5 {}\n".format(*names, *names))
+    images, depths = sequences._associated_names(tmp_path / "associations.txt")
+    times = ([1.0, 2.0], [1.5, 2.5])
+    assert images == [(t, image) for t in times[depth_first]]
+    assert depths == [(t, depth) for t in times[not depth_first]]
+
+
 #: Published calibrations of the three cameras: fx fy cx cy, and k1 k2 p1 p2 k3.
 FREIBURG = {
     1: ([517.3, 516.5, 318.6, 255.3], [0.2624, -0.9531, -0.0054, 0.0026, 1.1633]),
