@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import platform
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -16,6 +17,8 @@ from geodiff_plugin._internal.checks import bad_value
 
 PACKAGES = ("geodiff-plugin", "torch", "diffusers", "transformers", "accelerate", "kornia", "numpy", "pillow")
 SAMPLING_INTERVAL_S = 0.05
+#: Matches the name of a supported device.
+DEVICE = re.compile(r"(?P<kind>cuda|mps|cpu)(:(?P<index>0|[1-9][0-9]*))?")
 
 
 @functools.cache
@@ -38,17 +41,16 @@ def pick_device(name: str) -> torch.device:
     here = {"cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available()), "cpu": 1}
     if name == "auto":
         return torch.device(next(kind for kind, count in here.items() if count))
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = torch.device("meta")
-    if device.type not in here:
+    # torch.device wraps numbers to 8 bits: its cuda:256 is cuda:0.
+    found = DEVICE.fullmatch(name)
+    if found is None:
         bad_value("--device", "auto, cpu, cuda, cuda:N or mps", repr(name))
-    count = here[device.type]
-    if (device.index or 0) >= count:
-        got = f"PyTorch finds {count or 'no'} {device.type} devices."
+    kind, index = found["kind"], found["index"]
+    count = here[kind]
+    if int(index or 0) >= count:
+        got = f"PyTorch finds {count or 'no'} {kind} devices."
         bad_value("--device", "a device of this machine", repr(name), got)
-    return device
+    return torch.device(name)
 
 
 def timed(call: Callable[[], object], device: torch.device) -> float:

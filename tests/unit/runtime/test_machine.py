@@ -46,6 +46,9 @@ def test_a_device_of_this_machine_is_picked(found, cards, apple, name, device):
         ("cuda:2", "got 'cuda:2'. PyTorch finds 2 cuda devices"),
         ("mps", "got 'mps'. PyTorch finds no mps devices"),
         ("cpu:1", "got 'cpu:1'. PyTorch finds 1 cpu devices"),
+        ("cpu:200", "got 'cpu:200'. PyTorch finds 1 cpu devices"),  # torch would read -56
+        ("cuda:256", "got 'cuda:256'. PyTorch finds 2 cuda devices"),  # torch would read 0
+        ("cuda:01", "must be auto, cpu, cuda, cuda:N or mps; got 'cuda:01'"),
         ("gpu", "must be auto, cpu, cuda, cuda:N or mps; got 'gpu'"),
         ("meta", "must be auto, cpu, cuda, cuda:N or mps; got 'meta'"),
     ],
