@@ -9,6 +9,8 @@ import re
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -77,8 +79,10 @@ INDEX_OF_PRIOR: dict[str, Any] = {
 }
 #: Folder in the base by component name in the checkpoint.
 FOLDERS = {"Diffuser": "transformer", "VAE": "vae"}
-#: Patterns from names in the checkpoint to names in the base; LoRA factors get a suffix ``" A"`` or ``" B"``.
-NAMES = ((r"\.base_layer\.", "."), (r"\.lora_([AB])(\.default)?\.weight$", r".weight \1"))
+#: Part of the names of weights that have a LoRA, which their names in the base lack.
+BASE_LAYER = ".base_layer."
+#: Matches the end of the name of a LoRA factor in the checkpoint; the base has ``.weight`` there.
+LORA = re.compile(r"\.lora_(?P<factor>[AB])(\.default)?\.weight$")
 
 
 def convert_prior(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> str:
@@ -320,41 +324,62 @@ def _convert_file(source: Path, folder: Path, part: str | None) -> str:
 # Marigold V2 (arXiv 2609.08084): base, trained checkpoint and prompt
 
 
-def merged(name: str, weight: Tensor, trained: Mapping[str, Tensor]) -> Tensor:
-    """Merge trained weights into a base weight: replaced, or with the LoRA product added in float32."""
-    weight = trained.get(name, weight).to(weight.dtype)
-    if f"{name} A" not in trained:
-        return weight
-    # Alpha equals the rank in every published configuration, so the product of the factors has weight 1.
-    return (weight.float() + trained[f"{name} B"].float() @ trained[f"{name} A"].float()).to(weight.dtype)
+@dataclass(frozen=True)
+class Trained:
+    """Trained weights of one component by their names in the base.
+
+    Attributes:
+        replaced: weights in place of the base's.
+        factors: ``"A" (r, in)`` and ``"B" (out, r)`` of a LoRA, whose product is added to a weight.
+    """
+
+    replaced: Mapping[str, Tensor]
+    factors: Mapping[str, Mapping[str, Tensor]]
+
+    def merged(self, name: str, weight: Tensor) -> Tensor:
+        """Return the weight to write for one of the base, in its dtype; products are added in float32."""
+        weight = self.replaced.get(name, weight).to(weight.dtype)
+        if name not in self.factors:
+            return weight
+        A, B = (self.factors[name][factor].float() for factor in "AB")
+        # Alpha equals the rank in every published configuration, so the product of the factors has weight 1.
+        return (weight.float() + B @ A).to(weight.dtype)
 
 
-def _trained(state: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    """Return the trained weights of a component by their names in the base."""
-    result = {}
+def _trained(state: Mapping[str, Tensor], part: str) -> Trained:
+    """Return the trained weights of a component, whose names in the checkpoint start with ``part``."""
+    replaced, factors = dict[str, Tensor](), dict[str, dict[str, Tensor]]()
     for name, value in _part(state, f"{part}.").items():
-        for pattern, replacement in NAMES:
-            name = re.sub(pattern, replacement, name)
-        result[name] = value
-    return result
+        name = name.replace(BASE_LAYER, ".")
+        if found := LORA.search(name):
+            factors.setdefault(f"{name[: found.start()]}.weight", {})[found["factor"]] = value
+        else:
+            replaced[name] = value
+    return Trained(replaced, factors)
 
 
-def _base_files(base: Path, name: str) -> tuple[list[Path], set[str]]:
-    """Return the safetensors files of a base component and the names of their tensors."""
+def _reading_safetensors(file: Path) -> AbstractContextManager[None]:
+    hint = "Download it again and compare its size with the original's."
+    return reading(str(file), "a whole safetensors file", "a damaged one", hint)
+
+
+def _base_files(base: Path, name: str) -> tuple[list[Path], dict[str, tuple[int, ...]]]:
+    """Return the safetensors files of a base component and the shapes of their tensors by name."""
     folder = base / name
     if not os.path.isfile(folder / "config.json"):
         bad_value("BASE", f"a folder of Qwen/Qwen-Image-Edit-2509 with {name}/", base, "Check the path.")
     names = {path.name for path in folder.glob("*.safetensors")}
     if (folder / INDEX).is_file():
         names = set(json.loads((folder / INDEX).read_text("utf-8"))["weight_map"].values())
-    files, tensors = [folder / file for file in sorted(names)], set[str]()
+    files, shapes = [folder / file for file in sorted(names)], dict[str, tuple[int, ...]]()
     if not files or not all(file.is_file() for file in files):
         got = f"a folder without some of {', '.join(sorted(names)) or 'them'}"
         bad_value("BASE", f"a folder with safetensors in {folder}", got, "Download it again.")
     for file in files:
-        with safe_open(file, "pt") as opened:
-            tensors |= set(opened.keys())
-    return files, tensors
+        with _reading_safetensors(file), safe_open(file, "pt") as opened:
+            keys = opened.keys()
+            shapes |= {key: tuple(opened.get_slice(key).get_shape()) for key in keys}
+    return files, shapes
 
 
 def _read_prompt(file: Path, requested: str | None) -> Tensor:
@@ -371,25 +396,58 @@ def _read_prompt(file: Path, requested: str | None) -> Tensor:
 
 def _merge_into_base(base: Path, file: Path, folder: Path) -> None:
     """Write the base's networks with the trained weights and factors of a file, after checking them."""
-    state = load_file(file)
-    trained = {part: _trained(state, part) for part in FOLDERS}
-    sources = {}
-    for part, name in FOLDERS.items():
-        sources[name], tensors = _base_files(base, name)
-        known = trained[part]
-        factors = {f"{key[:-2]} {factor}" for key in known if " " in key for factor in "AB"}
-        missing = [f"{key[:-2]} of factor {key[-1]}" for key in factors - known.keys()]
-        check_weights(missing, {key.partition(" ")[0] for key in known} - tensors, str(file))
-    if not any(key.endswith(" A") for key in trained["Diffuser"]):
+    with _reading_safetensors(file):
+        state = load_file(file)
+    files = dict[str, list[Path]]()
+    trained = {name: _trained(state, part) for part, name in FOLDERS.items()}
+    for name, weights in trained.items():
+        files[name], shapes = _base_files(base, name)
+        _check_trained(weights, shapes, file)
+    if not trained[FOLDERS["Diffuser"]].factors:
         bad_value(str(file), "a checkpoint of Marigold V2 with a LoRA (Diffuser.*.lora_A.*)", "no LoRA")
-    for part, name in FOLDERS.items():
-        (folder / name).mkdir(parents=True)
-        for copied in ("config.json", INDEX):
-            if (base / name / copied).is_file():
-                shutil.copyfile(base / name / copied, folder / name / copied)
-        for source in sources[name]:
-            whole = {key: merged(key, v, trained[part]) for key, v in load_file(source).items()}
-            _save_weights(whole, folder / name / source.name)
+    for name, weights in trained.items():
+        _write_merged(weights, base / name, files[name], folder / name)
+
+
+def _check_trained(trained: Trained, base: Mapping[str, tuple[int, ...]], file: Path) -> None:
+    """Raise an error for factors without the other, and for names and shapes that differ from the base's."""
+    missing = [
+        f"LoRA factor {factor} of {name}"
+        for name, factors in trained.factors.items()
+        for factor in "AB"
+        if factor not in factors
+    ]
+    check_weights(missing, (trained.replaced.keys() | trained.factors.keys()) - base.keys(), str(file))
+    shapes = [(name, [tuple(value.shape)]) for name, value in trained.replaced.items()]
+    shapes += [(name, [tuple(of[factor].shape) for factor in "BA"]) for name, of in trained.factors.items()]
+    for name, given in shapes:
+        if _product_shape(given) != base[name]:
+            got = " @ ".join(map(str, given))
+            hint = "Pass the base that it was trained on, Qwen/Qwen-Image-Edit-2509."
+            bad_value(f"{name} in {file}", f"of the base's shape {base[name]}", got, hint)
+
+
+def _product_shape(shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...] | None:
+    """Return the shape of one array or of the product of two matrices; ``None`` if they have none."""
+    match shapes:
+        case [shape]:
+            return shape
+        case [(outputs, rank), (of_inputs, inputs)] if rank == of_inputs:
+            return (outputs, inputs)
+    return None
+
+
+def _write_merged(trained: Trained, base: Path, files: Sequence[Path], folder: Path) -> None:
+    """Write one network of the base with its trained weights, in the same files."""
+    folder.mkdir(parents=True)
+    for name in ("config.json", INDEX):
+        if (base / name).is_file():
+            shutil.copyfile(base / name, folder / name)
+    for file in files:
+        with _reading_safetensors(file):
+            state = load_file(file)
+        merged = {name: trained.merged(name, weight) for name, weight in state.items()}
+        _save_weights(merged, folder / file.name)
 
 
 def _convert_marigold_v2(

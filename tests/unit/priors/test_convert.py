@@ -46,15 +46,15 @@ def test_a_weight_is_replaced_or_has_the_product_of_its_factors_added():
     rng = torch.Generator().manual_seed(0)
     weight, other = torch.rand(5, 7, generator=rng), torch.rand(5, 7, generator=rng)
     down, up = torch.rand(2, 7, generator=rng), torch.rand(5, 2, generator=rng)
-    assert convert.merged("w", weight, {}) is weight
-    assert torch.equal(convert.merged("w", weight.half(), {"w": other}), other.half())
-    factors = {"w A": down, "w B": up, "v A": other}
-    expected = weight.numpy() + up.numpy() @ down.numpy()
-    np.testing.assert_allclose(convert.merged("w", weight, factors), expected, rtol=1e-6)
-    both = convert.merged("w", weight, factors | {"w": other})
+    assert convert.Trained({}, {}).merged("w", weight) is weight
+    assert torch.equal(convert.Trained({"w": other}, {}).merged("w", weight.half()), other.half())
+    factors = {"w": {"A": down, "B": up}}
+    trained, expected = convert.Trained({}, factors), weight.numpy() + up.numpy() @ down.numpy()
+    np.testing.assert_allclose(trained.merged("w", weight), expected, rtol=1e-6)
+    both = convert.Trained({"w": other}, factors).merged("w", weight)
     np.testing.assert_allclose(both, expected - weight.numpy() + other.numpy(), rtol=1e-6)
-    assert convert.merged("w", weight.bfloat16(), factors).dtype == torch.bfloat16
-    assert convert.merged("x", weight, factors) is weight
+    assert trained.merged("w", weight.bfloat16()).dtype == torch.bfloat16
+    assert trained.merged("x", weight) is weight
 
 
 def test_names_of_trained_weights_are_those_of_the_base():
@@ -64,12 +64,9 @@ def test_names_of_trained_weights_are_those_of_the_base():
         "Diffuser.block.lora_B.weight": 3,
         "VAE.conv.weight": 4,
     }
-    assert convert._trained(state, "Diffuser") == {
-        "block.weight": 1,
-        "block.weight A": 2,
-        "block.weight B": 3,
-    }
-    assert convert._trained(state, "VAE") == {"conv.weight": 4}
+    factors = {"block.weight": {"A": 2, "B": 3}}
+    assert convert._trained(state, "Diffuser") == convert.Trained({"block.weight": 1}, factors)
+    assert convert._trained(state, "VAE") == convert.Trained({"conv.weight": 4}, {})
     assert convert._part({"dit.a": 1, "dit.b.dit.c": 2, "dita": 3, 5: 6}, "dit.") == {"a": 1, "b.dit.c": 2}
 
 
@@ -111,16 +108,14 @@ def test_files_of_a_base_are_those_of_its_index(tmp_path):
         convert._base_files(tmp_path, "vae")
     for name in ("b", "a", "old"):
         save_file({f"{name}.weight": torch.zeros(1)}, folder / f"{name}.safetensors")
-    files, tensors = convert._base_files(tmp_path, "vae")
+    files, shapes = convert._base_files(tmp_path, "vae")
     assert [f.name for f in files] == ["a.safetensors", "b.safetensors", "old.safetensors"]
-    assert tensors == {"a.weight", "b.weight", "old.weight"}
+    assert shapes == {"a.weight": (1,), "b.weight": (1,), "old.weight": (1,)}
     index = {"weight_map": {"x": "b.safetensors", "y": "a.safetensors"}}
     (folder / convert.INDEX).write_text(json.dumps(index))
-    files, tensors = convert._base_files(tmp_path, "vae")
-    assert [f.name for f in files] == ["a.safetensors", "b.safetensors"] and tensors == {
-        "a.weight",
-        "b.weight",
-    }
+    files, shapes = convert._base_files(tmp_path, "vae")
+    assert [f.name for f in files] == ["a.safetensors", "b.safetensors"]
+    assert set(shapes) == {"a.weight", "b.weight"}
     (folder / "a.safetensors").unlink()
     with pytest.raises(ValueError, match="without some of a.safetensors, b.safetensors"):
         convert._base_files(tmp_path, "vae")
@@ -187,6 +182,9 @@ def test_for_a_missing_prompt_the_error_states_how_to_pass_it(tmp_path):
 
 
 # Whole checkpoints
+
+#: Name of a factor of the LoRA in ``assets_of_marigold_v2``.
+LORA = "Diffuser.block.lora_{}.default.weight"
 
 
 def assets_of_marigold_v2(folder, name="Log-stage2", masked=2):
@@ -290,12 +288,32 @@ def test_the_space_is_the_users_or_the_first_word_of_the_checkpoints_folder(tmp_
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda t: t.pop("Diffuser.block.lora_B.default.weight"), "missing: block.weight of factor B"),
-        (lambda t: t.pop("Diffuser.block.lora_A.default.weight"), "missing: block.weight of factor A"),
+        (lambda t: t.pop(LORA.format("B")), "missing: LoRA factor B of block.weight"),
+        (lambda t: t.pop(LORA.format("A")), "missing: LoRA factor A of block.weight"),
         (lambda t: t.update({"VAE.other.weight": torch.ones(1)}), "unexpected: other.weight"),
         (
-            lambda t: [t.pop(f"Diffuser.block.lora_{f}.default.weight") for f in "AB"],
+            lambda t: [t.pop(LORA.format(factor)) for factor in "AB"],
             r"a checkpoint of Marigold V2 with a LoRA \(Diffuser.*; got no LoRA",
+        ),
+        (
+            lambda t: t.update({"Diffuser.norm.base_layer.weight": torch.rand(5)}),
+            r"norm.weight in .* must be of the base's shape \(4,\); got \(5,\)",
+        ),
+        (
+            lambda t: t.update({"VAE.conv.weight": torch.rand(2, 9)}),
+            r"conv.weight in .* must be of the base's shape \(2, 3\); got \(2, 9\)",
+        ),
+        (
+            lambda t: t.update({LORA.format("A"): torch.rand(2, 7)}),
+            r"block.weight in .* must be of the base's shape \(4, 6\); got \(4, 2\) @ \(2, 7\)",
+        ),
+        (
+            lambda t: t.update({LORA.format("A"): torch.rand(3, 6)}),
+            r"block.weight in .* must be of the base's shape \(4, 6\); got \(4, 2\) @ \(3, 6\)",
+        ),
+        (
+            lambda t: t.update({LORA.format("A"): torch.rand(2, 6, 1, 1)}),
+            r"block.weight in .*; got \(4, 2\) @ \(2, 6, 1, 1\)",
         ),
     ],
 )
@@ -310,6 +328,22 @@ def test_trained_weights_that_do_not_fit_the_base_are_named_before_anything_is_w
     with pytest.raises(ValueError, match=words) as error:
         convert._merge_into_base(tmp_path / "base", file, out)
     assert str(file) in str(error.value) and not out.exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Marigold-V2/depth/Log-stage2/trainables.safetensors", "base/vae/b.safetensors"],
+)
+@pytest.mark.parametrize("length", [6, 60, -8])
+def test_a_truncated_file_is_reported_by_its_name(tmp_path, name, length):
+    assets_of_marigold_v2(tmp_path)
+    file = tmp_path / name
+    file.write_bytes(file.read_bytes()[:length])
+    paths = "marigold-v2", tmp_path / "base", tmp_path / "Marigold-V2/depth/Log-stage2", tmp_path / "out"
+    with pytest.raises(ValueError, match="must be a whole safetensors file; got a damaged one") as error:
+        convert.convert_prior([Path(path) for path in paths])
+    assert str(error.value).startswith(str(file))
+    assert {path.name for path in tmp_path.iterdir()} == {"base", "Marigold-V2"}
 
 
 def test_a_checkpoint_is_a_folder_with_the_authors_file_or_a_file_of_safetensors(tmp_path):
