@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -91,15 +92,16 @@ def find_convention(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> C
         matches: matches of pairs of frames.
     """
     some = matches[:: max(1, len(matches) // MAX_PAIRS)]
-    conventions = list(_conventions(E))
-    misfits = [_misfit(each.E, K, some) for each in conventions]
-    best = 0
-    for rotated in (False, True):
-        among = [k for k, each in enumerate(conventions) if (each.quarters > 0) is rotated]
-        k = min(among, key=misfits.__getitem__)
-        best = k if misfits[k] < CONVENTION_GAIN * misfits[best] else best
-    off_px = median_px(residuals_px(conventions[best].E, K, some))
-    return conventions[best]._replace(off_px=off_px, off=off_px / float(np.median(K[:, 0, 0])))
+    fits = [(_misfit(each.E, K, some), each) for each in _conventions(E)]
+    as_given = fits[0]
+    upright = min((fit for fit in fits if not fit[1].quarters), key=itemgetter(0))
+    rotated = min((fit for fit in fits if fit[1].quarters), key=itemgetter(0))
+    chosen = upright if upright[0] < CONVENTION_GAIN * as_given[0] else as_given
+    # The best upright convention counts here even if it is not clearly better than the given one.
+    chosen = rotated if rotated[0] < CONVENTION_GAIN * upright[0] else chosen
+    found = chosen[1]
+    off_px = median_px(residuals_px(found.E, K, some))
+    return found._replace(off_px=off_px, off=off_px / float(np.median(K[:, 0, 0])))
 
 
 def reported_convention(found: Convention) -> list[Finding]:
