@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from geodiff_plugin._internal.checks import InputError, bad_value
+from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.formats.rigs import (
     CHECK_FILE,
+    COLMAP_LENSES,
+    LENS_MODELS,
     CameraChoice,
     RawCamera,
     array_of,
@@ -149,18 +150,35 @@ def _rig_of_infos(infos: list[Entries], choice: CameraChoice) -> Rig:
     if not rig.E[:3, 3].any():
         expected = "-fx * baseline in the right camera's file"
         bad_value("projection_matrix[0, 3]", expected, "the same in both", ROS_ALONE)
-    if not all(info.get("rectified", True) for info in infos):
-        return _taken_by_ros(rig, infos, sizes, binnings).as_taken or rig
-    with suppress(InputError, KeyError):  # a file of rectified images may omit the original cameras
-        return _taken_by_ros(rig, infos, sizes, binnings)
-    return rig
+    are_raw = not all(info.get("rectified", True) for info in infos)
+    if not are_raw and not all(map(_has_raw_camera, infos)):
+        return rig
+    with_raw = _with_raw_cameras(rig, infos, sizes, binnings)
+    return with_raw.as_taken or rig if are_raw else with_raw
 
 
-def _taken_by_ros(
+def _has_raw_camera(info: Entries) -> bool:
+    """Whether entries for rectified images also describe the camera before rectification.
+
+    Drivers may leave these entries out, empty or zero, or name a lens model that OpenCV lacks.
+
+    Raises:
+        InputError: entries that are no numbers.
+    """
+    K, D, R = (_of_ros(info, name) for name in "KDR")
+    if K is None or D is None or R is None or "distortion_model" not in info:
+        return False
+    model = str(info["distortion_model"])
+    if model.lower() not in LENS_MODELS and model not in COLMAP_LENSES:
+        return False
+    return bool(array_of(K, (-1,), "K").any() and array_of(R, (-1,), "R").any())
+
+
+def _with_raw_cameras(
     rig: Rig, infos: list[Entries], sizes: list[tuple[Any, Any]], binnings: list[np.ndarray]
 ) -> Rig:
     """Return the rectified rig with its raw cameras."""
-    cameras = [
+    left, right = (
         RawCamera(
             _of_window(info, binning) @ array_of(_of_ros(info, "K"), (3, 3), "K"),
             size,
@@ -168,6 +186,6 @@ def _taken_by_ros(
             str(info["distortion_model"]),
         )
         for info, size, binning in zip(infos, sizes, binnings, strict=True)
-    ]
+    )
     R_left, R_right = (_of_ros(info, "R") for info in infos)
-    return rectified_from(rig, cameras[0], cameras[1], (R_left, R_right))
+    return rectified_from(rig, left, right, (R_left, R_right))

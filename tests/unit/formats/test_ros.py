@@ -79,6 +79,47 @@ def test_ros_files_of_rectified_images_may_omit_the_original_cameras():
         assert rig.as_taken is None and rig.rectified
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"distortion_model": "double_sphere"},  # which rectified images do not need
+        {"camera_matrix": {"data": [0.0] * 9}},  # a driver that knows only P
+        {"rectification_matrix": {"data": []}},
+    ],
+)
+def test_a_driver_may_leave_the_original_camera_empty(changes):
+    (P1, R1), (P2, R2) = rectified()
+    rig = ros([info(0, P1, R1), info(1, P2, R2, **changes)])
+    assert rig.as_taken is None and rig.rectified
+    with pytest.raises(InputError):
+        ros([info(0, P1, R1), info(1, P2, R2, rectified=False, **changes)])
+
+
+def test_a_rectified_camera_without_lens_coefficients_had_no_distortion():
+    (P1, R1), (P2, R2) = rectified()
+    none = {"distortion_coefficients": {"data": []}}
+    taken = ros([info(0, P1, R1, **none), info(1, P2, R2, **none)]).as_taken
+    assert taken.left.lens is taken.right.lens is None
+
+
+@pytest.mark.parametrize(
+    ("name", "damaged", "reported"),
+    [
+        ("distortion_coefficients", "hello", "the lens distortion of the right camera must be"),
+        ("distortion_coefficients", [0.1, 0.2, 0.3], "the lens distortion of the right camera must be"),
+        ("camera_matrix", "hello", "K must be"),
+        ("camera_matrix", [500.0] * 8, "K must be 9 finite numbers; got 8"),
+        ("rectification_matrix", [1.0, "x"], "R must be"),
+        ("rectification_matrix", [2.0] * 9, "the rectifying rotation"),
+    ],
+)
+def test_damaged_original_cameras_are_not_ignored(name, damaged, reported):
+    """Without them, raw images are not recognised as such."""
+    (P1, R1), (P2, R2) = rectified()
+    with pytest.raises(InputError, match=reported):
+        ros([info(0, P1, R1), info(1, P2, R2, **{name: {"data": damaged}})])
+
+
 def test_region_of_interest_shifts_all_principal_points():
     (P1, R1), (P2, R2) = rectified()
     windows = [
