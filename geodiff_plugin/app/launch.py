@@ -97,32 +97,37 @@ def _names_loopback(headers: dict[bytes, bytes]) -> bool:
     return host is not None and _is_loopback(host)
 
 
-def _is_locked(file: IO[bytes]) -> bool:
-    """Lock an open file until it is closed; return whether another process has locked it."""
+def _try_lock(file: IO[bytes]) -> bool:
+    """Lock an open file until it is closed; return whether that succeeded."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # locked, or a file system without locks
-        return True
-    return False
+    except OSError:  # locked by another process, or a file system without locks
+        return False
+    return True
 
 
 def _remove_leftovers() -> None:
     """Delete the folders of killed servers, which are those whose lock nobody holds."""
     for lock in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/{LOCK}") if fcntl else ():
         with suppress(OSError), lock.open("rb") as file:  # of another user, or already deleted
-            if not _is_locked(file):
+            if _try_lock(file):
                 shutil.rmtree(lock.parent, ignore_errors=True)
 
 
 def _new_folder() -> str:
     """Create and lock the folder of uploads and results, which is deleted at exit."""
-    folder = tempfile.mkdtemp(prefix=FOLDER_PREFIX)
+    folder = tempfile.mkdtemp(prefix=FOLDER_PREFIX) if fcntl is None else _new_locked_folder()
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    lock = open(Path(folder, LOCK), "wb")  # noqa: SIM115 - locked until the process ends
-    if fcntl:
-        _is_locked(lock)
-    atexit.register(lock.close)
     return folder
+
+
+def _new_locked_folder() -> str:
+    hidden = Path(tempfile.mkdtemp(prefix=f".{FOLDER_PREFIX}"))
+    lock = (hidden / LOCK).open("wb")
+    atexit.register(lock.close)  # keeps it open, and so locked, until the process ends
+    _try_lock(lock)
+    # Until now another server would have taken it for the folder of a killed one.
+    return str(hidden.rename(hidden.with_name(hidden.name.removeprefix("."))))
 
 
 def launch_page(

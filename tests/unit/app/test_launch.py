@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -139,7 +140,7 @@ def test_a_launched_page_has_a_folder_of_its_own_and_its_limits(page, tmp_path):
     )
     assert os.environ["GRADIO_TEMP_DIR"] == str(folder)
     assert os.environ["GRADIO_ANALYTICS_ENABLED"] == "False" and os.environ["HF_HUB_DISABLE_TELEMETRY"] == "1"
-    ((remove, place), options), *_ = page.exits
+    (((remove, place), options),) = [each for each in page.exits if each[0][0] is shutil.rmtree]
     assert place == str(folder) and options == {"ignore_errors": True}
     remove(place, **options)
     assert not folder.exists()
@@ -217,13 +218,32 @@ def test_leftovers_of_killed_servers_are_removed_and_those_of_running_ones_stay(
     other.mkdir()
     (other / "lock").touch()
     with (running / "lock").open("wb") as lock:
-        assert not launch._is_locked(lock)
+        assert launch._try_lock(lock)
         own = Path(launch._new_folder())
         launch._remove_leftovers()
         assert not killed.exists() and running.exists() and young.exists() and other.exists() and own.exists()
     launch._remove_leftovers()
     assert not running.exists() and own.exists(), "the process that locked it has ended"
-    at_exit[-1]()
+    at_exit[0]()  # closes the lock
+
+
+@pytest.mark.skipif(not launch.fcntl, reason="Windows has no such locks")
+def test_a_folder_that_is_not_locked_yet_is_not_taken_for_a_leftover(tmp_path, monkeypatch):
+    """Another server cleans up between creating the file and locking it."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    at_exit, flock = [], launch.fcntl.flock
+    monkeypatch.setattr(launch.atexit, "register", lambda call, *_, **__: at_exit.append(call))
+
+    def late(*given):
+        monkeypatch.setattr(launch.fcntl, "flock", flock)
+        launch._remove_leftovers()
+        flock(*given)
+
+    monkeypatch.setattr(launch.fcntl, "flock", late)
+    folder = Path(launch._new_folder())
+    launch._remove_leftovers()
+    assert [path.name for path in folder.iterdir()] == ["lock"] and list(tmp_path.iterdir()) == [folder]
+    at_exit[0]()
 
 
 def test_a_server_of_its_own_process_is_killed_and_the_next_one_cleans_up(tmp_path):
