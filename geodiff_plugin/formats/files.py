@@ -6,6 +6,7 @@ import codecs
 import hashlib
 import os
 import re
+import traceback
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -23,12 +24,14 @@ if TYPE_CHECKING:  # errors in files are reported before numpy is imported
 
 PathLike = str | os.PathLike[str]
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-#: EXIF tag of the orientation; values of 5 and above swap width and height.
+#: EXIF tag of the orientation.
 ORIENTATION = 0x0112
 #: Value of the tag for an image displayed as stored.
 UPRIGHT = 1
 #: Values of the tag that rotate or mirror the image.
 ORIENTATIONS = range(2, 9)
+#: Those that swap width and height.
+SWAPPING_ORIENTATIONS = range(5, 9)
 #: Matches a number with a decimal comma, between blanks, semicolons or line ends.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
 #: Maximum size of a calibration file; larger files are of another kind.
@@ -88,29 +91,27 @@ def _raise_placeholder(file: Path, name: str, what: str) -> None:
 #: Number of bytes needed to recognise a web page or a Git LFS pointer.
 STAND_IN_BYTES = 64
 MAP_SUFFIXES = (".npy", ".npz", ".pfm", ".png")
+HEIC_SUFFIXES = (".heic", ".heif")
+#: Types of error that Pillow's decoders raise for damaged files.
 DECODE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError, zlib.error)
 
 
 @contextmanager
 def open_image(path: PathLike, name: str, what: str = "an image file") -> Iterator[Image.Image]:
-    """Open an image file with Pillow (HEIC with pillow-heif); raise an error if it is not a whole image."""
+    """Open an image file with Pillow (HEIC with pillow-heif); raise an error if it is not a whole image.
+
+    Pillow decodes lazily, so damage may only be found inside the block. Errors that Pillow raises there are
+    reported as damage as well; others are raised unchanged.
+    """
     from PIL import Image, UnidentifiedImageError
 
     file = check_file(path, name, what)
-    if file.suffix.lower() in (".heic", ".heif"):
-        try:
-            import pillow_heif
-        except ImportError:
-            hint = (
-                "Install it with: pip install pillow-heif (extra heic), or convert the file to PNG or JPEG."
-            )
-            bad_value(name, what, f"{file}, which needs pillow-heif", hint, code="image.heic")
-        pillow_heif.register_heif_opener()
+    if file.suffix.lower() in HEIC_SUFFIXES:
+        _register_heif(file, name, what)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", Image.DecompressionBombWarning
-            )  # images that are too large raise an error
+            # Images that are too large raise an error.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(file)
         with image:
             yield image
@@ -120,9 +121,27 @@ def open_image(path: PathLike, name: str, what: str = "an image file") -> Iterat
         hint = "Convert it to PNG or JPEG."
         bad_value(name, what, f"{file}, a format that Pillow does not read", hint, code="image.unreadable")
     except (Image.DecompressionBombError, *DECODE_ERRORS) as error:
+        if not _is_of_decoder(error):
+            raise
         hint = "It may be truncated or too large."
         got = f"{file}, which cannot be decoded ({error})"
         bad_value(name, "a whole image file", got, hint, code="image.unreadable")
+
+
+def _register_heif(file: Path, name: str, what: str) -> None:
+    """Let Pillow read HEIC files."""
+    try:
+        import pillow_heif
+    except ImportError:
+        hint = "Install it with: pip install pillow-heif (extra heic), or convert the file to PNG or JPEG."
+        bad_value(name, what, f"{file}, which needs pillow-heif", hint, code="image.heic")
+    pillow_heif.register_heif_opener()
+
+
+def _is_of_decoder(error: Exception) -> bool:
+    """Whether an error was raised in Pillow or pillow-heif, directly or by a function that they called."""
+    modules = (frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__))
+    return any(module.partition(".")[0] in ("PIL", "pillow_heif") for module in modules)
 
 
 def save_png(image: Image.Image, file: PathLike | IO[bytes]) -> None:
@@ -187,8 +206,8 @@ def upright_size(path: PathLike, name: str) -> tuple[int, int]:
     """Return ``(width, height)`` of an image file in its EXIF orientation."""
     with open_image(path, name) as image:
         width, height = image.size
-        rotated = exif_of(image).get(ORIENTATION, 1) >= 5
-    return (height, width) if rotated else (width, height)
+        swapped = exif_of(image).get(ORIENTATION) in SWAPPING_ORIENTATIONS
+    return (height, width) if swapped else (width, height)
 
 
 def is_reoriented(path: PathLike) -> bool:

@@ -16,7 +16,15 @@ from geodiff_plugin._internal.camera_checks import check_intrinsics
 from geodiff_plugin._internal.checks import InputError, bad_type, bad_value, check_choice, check_number, warn
 from geodiff_plugin.cameras import Camera
 from geodiff_plugin.findings import Finding
-from geodiff_plugin.formats.files import ORIENTATION, ORIENTATIONS, UPRIGHT, PathLike, exif_of, open_image
+from geodiff_plugin.formats.files import (
+    ORIENTATION,
+    ORIENTATIONS,
+    SWAPPING_ORIENTATIONS,
+    UPRIGHT,
+    PathLike,
+    exif_of,
+    open_image,
+)
 from geodiff_plugin.formats.frame_packing import FRAME_LAYOUTS, Packing, find_packing
 from geodiff_plugin.formats.maps import MAX_16_BITS
 from geodiff_plugin.formats.rigs import intrinsics
@@ -283,8 +291,8 @@ def intrinsics_from_exif(
     if not isinstance(source, Image.Image):
         with open_image(source, name) as image:
             K, findings = intrinsics_from_exif(image, name)
-            rotated = exif_of(image).get(ORIENTATION, 1) >= 5 and not as_stored
-        return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if rotated else K, findings
+            swapped = exif_of(image).get(ORIENTATION) in SWAPPING_ORIENTATIONS and not as_stored
+        return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if swapped else K, findings
     number = partial(_exif_number, exif_of(source).get_ifd(IFD.Exif))
     width, height = source.size
     taken = number(Base.ExifImageWidth), number(Base.ExifImageHeight)

@@ -3,6 +3,7 @@
 import codecs
 import hashlib
 import os
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,10 @@ def test_what_a_failed_download_left_is_no_file(head, said, tmp_path):
         check_file(tmp_path / "a", "left")
 
 
+#: Entry of a TIFF directory, 4 bytes of ASCII, and the offset of the next one.
+ORIENTATION_AS_TEXT = struct.pack("<HHI4sI", 0x0112, 2, 4, b"six", 0)
+
+
 def test_errors_about_unreadable_images_state_the_reason(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no image at all")
     Image.fromarray(RNG.integers(0, 255, (50, 60, 3), np.uint8)).save(tmp_path / "b.png")
@@ -88,8 +93,25 @@ def test_errors_about_unreadable_images_state_the_reason(tmp_path):
     assert stored_size(tmp_path / "b.png", "left") == (60, 50)
 
 
+@pytest.mark.parametrize("kind", [KeyError, TypeError, ValueError, OSError, EOFError])
+def test_errors_of_the_block_are_not_taken_for_damage(tmp_path, kind):
+    Image.new("RGB", (4, 3)).save(tmp_path / "a.png")
+    with pytest.raises(kind, match=r"\A.?mine.?\Z"), open_image(tmp_path / "a.png", "left") as image:
+        image.load()
+        raise kind("mine")
+
+
+def test_an_orientation_that_is_no_number_is_ignored(tmp_path):
+    Image.new("RGB", (4, 3)).save(
+        tmp_path / "a.jpg", exif=b"Exif\0\0II*\0\x08\0\0\0\x01\0" + ORIENTATION_AS_TEXT
+    )
+    assert upright_size(tmp_path / "a.jpg", "left") == (4, 3) and not is_reoriented(tmp_path / "a.jpg")
+    with pytest.raises(InputError, match="no focal length in its EXIF"):
+        intrinsics_from_exif(tmp_path / "a.jpg", "left")
+
+
 @pytest.mark.parametrize("orientation", [None, *range(1, 10)])
-def test_an_image_is_turned_by_orientations_2_to_8_and_lies_on_its_side_from_5_on(orientation, tmp_path):
+def test_an_image_is_turned_by_orientations_2_to_8_and_lies_on_its_side_from_5_to_8(orientation, tmp_path):
     exif = Image.Exif()
     if orientation is not None:
         exif[0x0112] = orientation
@@ -99,7 +121,7 @@ def test_an_image_is_turned_by_orientations_2_to_8_and_lies_on_its_side_from_5_o
         number = orientation or 1
         assert is_reoriented(path) == (2 <= number <= 8)
         assert stored_size(path, "left") == (48, 40)
-        assert upright_size(path, "left") == ((40, 48) if number >= 5 else (48, 40))
+        assert upright_size(path, "left") == ((40, 48) if 5 <= number <= 8 else (48, 40))
 
 
 def test_pngs_are_written_whole_by_run_lengths(tmp_path):
