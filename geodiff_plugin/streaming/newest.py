@@ -26,11 +26,15 @@ class Newest(Generic[T]):
         with self._changed:
             if self._closed:
                 return False
-            self._values = mine = [value]
+            self._values = mine = [value]  # the list identifies this value; others may be equal
             self._changed.notify_all()
-            if self._waits:
-                self._changed.wait_for(lambda: self._closed or self._values is not mine)
-            return not self._closed
+            if not self._waits:
+                return True
+            self._changed.wait_for(lambda: self._closed or self._values is not mine)
+            if self._values is not mine:
+                return True
+            self._values = []  # closed before it was taken
+            return False
 
     def take(self) -> T | None:
         """Wait for a value and return it; ``None`` after ``close``, or raise the error that it was given."""
@@ -45,7 +49,10 @@ class Newest(Generic[T]):
             return None
 
     def close(self, error: BaseException | None = None) -> None:
-        """End the exchange for both threads; a last value can still be taken, then ``error`` is raised."""
+        """End the exchange for both threads.
+
+        A last value can still be taken, unless its sender waits for that. Then ``error`` is raised.
+        """
         with self._changed:
             self._closed, self._error = True, self._error or error
             self._changed.notify_all()

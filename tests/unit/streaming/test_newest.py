@@ -71,3 +71,17 @@ def test_the_end_frees_a_waiting_thread(waiting):
     slot.close()
     thread.join(5)
     assert not thread.is_alive() and answers == [False if waiting == "put" else None]
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_the_end_shows_a_sender_whether_its_value_was_taken(taken, monkeypatch):
+    slot = Newest[int](waits=True)
+
+    def wait_for(condition):
+        if not condition():  # the sender waits: what another thread does meanwhile
+            assert not taken or slot.take() == 1
+            slot.close()
+
+    monkeypatch.setattr(slot._changed, "wait_for", wait_for)
+    assert slot.put(1) == taken
+    assert slot.take() is None
