@@ -359,7 +359,7 @@ def _capture_of(models: Iterable[Files], path: Path, images_at: Path | None) -> 
         seen = read_points(folder)
     except MissingFileError:
         seen = {}
-    images = Images(sorted(model.images), image_folders(*_around(folder, path)), path, images_at)
+    images = Images.find(sorted(model.images), image_folders(*_around(folder, path)), path, images_at)
 
     def build(frame: CaptureFrame, image: PosedImage) -> Candidate:
         points = seen.get(image.number)

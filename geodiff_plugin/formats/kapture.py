@@ -71,7 +71,7 @@ def _kapture(folder: Path, images_at: Path | None) -> Layout:
         return posed(frame, E, camera)
 
     folders = [at for at in (folder / "records_data", folder) if at.is_dir()]
-    images = Images([name for _, _, name, *_ in records], folders, folder, images_at)
+    images = Images.find([name for _, _, name, *_ in records], folders, folder, images_at)
     return images.layout("kapture", records, build)
 
 

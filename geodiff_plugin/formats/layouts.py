@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -196,38 +196,51 @@ class CameraPerImage:
 
 
 class Images:
-    """Images listed in a file of cameras.
+    """Images listed in a file of cameras, as found by ``find``.
 
-    Searches ``folders`` of a ``project`` (the first is the file's folder), then any folder near it, except
-    folders with names in ``other``. If ``given`` is a folder, searches only that. ``findings`` state where
-    the images are.
+    Args:
+        names: names in the file, in order.
+        files: the image of each name, or ``None``.
+        searched: the places without an image of a name, for messages.
+        findings: messages about the place of the images.
     """
 
     def __init__(
         self,
         names: Sequence[str],
+        files: Mapping[str, Path | None],
+        searched: str,
+        findings: tuple[Finding, ...] = (),
+    ) -> None:
+        self.names, self.findings = list(names), findings
+        self._files, self._problem, self._used = files, f"{NO_IMAGE} in {searched}", set[str]()
+
+    @classmethod
+    def find(
+        cls,
+        names: Sequence[str],
         folders: Sequence[Path],
         project: Path,
         given: Path | None = None,
         other: Sequence[str] = (),
-    ) -> None:
-        self.names, self.findings = list(names), tuple[Finding, ...]()
+    ) -> Self:
+        """Search ``folders`` of a ``project``, of which the first has the file, then any folder near it.
+
+        Folders with names in ``other`` are skipped. If ``given`` is a folder, only that is searched.
+        """
         once = list(dict.fromkeys(names))
         folders = folders if given is None else [_folder_of_images(given)]
-        files, below = find_images(once, folders), project if project.is_dir() else project.parent
-        places = [os.path.relpath(folder, below) for folder in folders]
-        searched = ", ".join("its folder" if at == "." else at for at in places)
-        self._problem = f"{NO_IMAGE} in {searched}"
-        if once and not any(files) and not is_any_there(once, folders):
-            levels = LEVELS_UP if given is None else 0
-            moved = find_moved(once, folders[0], levels, other)
-            if moved is None:
-                self._problem += " or elsewhere near it; pass their folder (--images)"
-            else:
-                files, at = moved.files, os.path.relpath(moved.below, below)
-                sentence = f"Images are read from {at}, because {searched} has none."
-                self.findings = (Finding("capture.images-found", sentence),) if given is None else ()
-        self._files, self._used = dict(zip(once, files, strict=True)), set[str]()
+        files, searched = find_images(once, folders), _relative(folders, project)
+        if not once or any(files) or is_any_there(once, folders):
+            return cls(names, dict(zip(once, files, strict=True)), searched)
+        moved = find_moved(once, folders[0], LEVELS_UP if given is None else 0, other)
+        if moved is None:
+            searched += " or elsewhere near it; pass their folder (--images)"
+            return cls(names, dict.fromkeys(once), searched)
+        place = _relative([moved.below], project)
+        sentence = f"Images are read from {place}, because {searched} has none."
+        findings = (Finding("capture.images-found", sentence),) if given is None else ()
+        return cls(names, dict(zip(once, moved.files, strict=True)), place, findings)
 
     def file(self, name: str) -> Path | None:
         """Return the image with a name, or ``None``."""
@@ -260,6 +273,13 @@ class Images:
         missing = Path(name.replace("\\", "/"))
         problem = "named twice; the first is used" if twice else self._problem
         return Candidate(CaptureFrame(missing.name, missing), None, problem)
+
+
+def _relative(folders: Sequence[Path], project: Path) -> str:
+    """Return the names of folders, relative to the folder of a project."""
+    start = project if project.is_dir() else project.parent
+    places = [os.path.relpath(folder, start) for folder in folders]
+    return ", ".join("its folder" if place == "." else place for place in places)
 
 
 def _folder_of_images(given: Path) -> Path:

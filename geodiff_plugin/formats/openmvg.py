@@ -83,7 +83,7 @@ def read_openmvg(path: Path, images_at: Path | None = None) -> Layout | None:
         E = pose and _pose(array_of(pose["rotation"], (3, 3), "rotation"), pose["center"])
         return posed(frame, E, camera and _openmvg_camera(*camera))
 
-    images = Images(names, image_folders(file.parent, file.parent.parent), file, images_at)
+    images = Images.find(names, image_folders(file.parent, file.parent.parent), file, images_at)
     return images.layout("OpenMVG", views, build)
 
 
@@ -120,7 +120,7 @@ def read_alicevision(path: Path, images_at: Path | None = None) -> Layout | None
         return posed(frame, E, camera and _alicevision_camera(camera, version))
 
     views, folders = data["views"], image_folders(file.parent, file.parent.parent)
-    images = Images([str(view["path"]) for view in views], folders, file, images_at)
+    images = Images.find([str(view["path"]) for view in views], folders, file, images_at)
     return images.layout("AliceVision", views, build)
 
 

@@ -111,7 +111,7 @@ def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
             sensors[sensor.get("id")] = str(error)
     scale, cameras = part.scale(), part.cameras()
     labels = [str(camera.get("label")) for camera in cameras]
-    images = Images(labels, image_folders(file.parent), file, images_at)
+    images = Images.find(labels, image_folders(file.parent), file, images_at)
 
     def build(frame: CaptureFrame, camera: Element) -> Candidate:
         sensor = sensors.get(camera.get("sensor_id"), "its sensor is not in the file")
@@ -178,7 +178,7 @@ def _opensfm(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
     undistorted = file.parent.name == UNDISTORTED
     folders = image_folders(file.parent, *(() if undistorted else (file.parent.parent,)))
     distorted = IMAGE_FOLDERS if undistorted and images_at is None else ()
-    images = Images([name for name, _ in shots], folders, file, images_at, distorted)
+    images = Images.find([name for name, _ in shots], folders, file, images_at, distorted)
 
     def build(frame: CaptureFrame, shot: Entries) -> Candidate:
         turn = Rotation.from_rotvec(array_of(shot["rotation"], (3,), "rotation"))
@@ -240,7 +240,7 @@ def _bundler(file: Path, counts: str, lines: Iterator[str], images_at: Path | No
     count = int(counts.split()[0])
     if count != len(names):
         bad_value(f"{listed.name}", f"a list of the {count} images in {file.name}", f"{len(names)}")
-    images = Images(names, image_folders(*above), file, images_at)
+    images = Images.find(names, image_folders(*above), file, images_at)
 
     def build(frame: CaptureFrame, rows: list[str]) -> Candidate:
         f, k1, k2 = array_of(rows[0].split(), (3,), "f k1 k2")
@@ -271,7 +271,7 @@ def _nvm(file: Path, lines: Iterator[str], images_at: Path | None) -> Layout:
         for _ in range(int(next(lines, "0")))
     ]
     folders = image_folders(file.parent, file.parent.parent)
-    images = Images([row[0].strip() for row in rows], folders, file, images_at)
+    images = Images.find([row[0].strip() for row in rows], folders, file, images_at)
 
     def build(frame: CaptureFrame, words: str) -> Candidate:
         f, qw, qx, qy, qz, *place, k, _ = array_of(words.split(), (10,), "the numbers of an image")

@@ -55,7 +55,7 @@ def read_splat_cameras(path: Path, images_at: Path | None = None) -> Layout | No
 
 def _splat_cameras(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
     folders = image_folders(file.parent, file.parent.parent)
-    images = Images([str(each["img_name"]) for each in data], folders, file, images_at)
+    images = Images.find([str(each["img_name"]) for each in data], folders, file, images_at)
 
     def build(frame: CaptureFrame, entries: Entries) -> Candidate:
         R = array_of(entries["rotation"], (3, 3), "rotation")
@@ -121,7 +121,7 @@ def read_sdfstudio(path: Path, images_at: Path | None = None) -> Layout | None:
 
 def _sdfstudio(file: Path, data: Entries, images_at: Path | None) -> Layout:
     frames = data["frames"]
-    images = Images([str(each["rgb_path"]) for each in frames], [file.parent], file, images_at)
+    images = Images.find([str(each["rgb_path"]) for each in frames], [file.parent], file, images_at)
 
     def build(frame: CaptureFrame, entries: Entries) -> Candidate:
         K = array_of([row[:3] for row in entries["intrinsics"][:3]], (3, 3), "intrinsics")

@@ -231,7 +231,7 @@ def _images(frames: Iterable[Frame], file: Path, images_at: Path | None) -> Imag
     of_scannetpp, of_other_lens = folders if "undistorted" in file.stem else folders[::-1]
     siblings = [file.parent.parent / name for name in of_scannetpp]
     places = [*image_folders(file.parent), *(folder for folder in siblings if folder.is_dir())]
-    return Images([str(frame["file_path"]) for frame in frames], places, file, images_at, of_other_lens)
+    return Images.find([str(frame["file_path"]) for frame in frames], places, file, images_at, of_other_lens)
 
 
 def _findings(file: Path) -> tuple[Finding, ...]:

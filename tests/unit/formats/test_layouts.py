@@ -69,7 +69,7 @@ def build(frame, entry):
 def test_images_are_found_and_duplicate_names_are_skipped(scan):
     a, b = write_images(scan / "images", ["a.png", "b.jpg"])
     names = ["set/a.png", "b.png", "set/a.png", "sub\\c.png"]
-    images = Images(names, [scan, scan / "images"], scan / "model.txt")
+    images = Images.find(names, [scan, scan / "images"], scan / "model.txt")
     assert images.names == names and images.findings == ()
     assert [images.file(name) for name in names] == [a, b, a, None]
     candidates = images.candidates(build, "wxyz")
@@ -89,39 +89,47 @@ def test_moved_images_are_searched_up_to_two_folders_above(scan):
     moved = write_images(scan.parent / "photos" / "set", ["a.png", "b.png"])
     (scan / "sparse" / "model").mkdir(parents=True)
     file = scan / "sparse" / "model" / "cameras.txt"
-    images = Images(["a.png", "b.png"], [file.parent], file)
+    images = Images.find(["a.png", "b.png"], [file.parent], file)
     assert [images.file(name) for name in ("a.png", "b.png")] == [None, None]
     problem = images.candidates(build, "xy")[0].problem
     assert problem == "no image file in its folder or elsewhere near it; pass their folder (--images)"
     file = scan / "cameras.txt"
-    images = Images(["a.png", "b.png"], [scan], file)
+    images = Images.find(["a.png", "b.png"], [scan], file)
     assert [images.file(name) for name in ("a.png", "b.png")] == moved
     (finding,) = images.findings
     assert finding.code == "capture.images-found"
     assert finding == "Images are read from ../photos/set, because its folder has none."
-    assert Images(["a.png"], [scan], file, other=("photos",)).file("a.png") is None
-    by_folder = Images(["a.png", "b.png"], [scan], scan)
+    assert Images.find(["a.png"], [scan], file, other=("photos",)).file("a.png") is None
+    by_folder = Images.find(["a.png", "b.png"], [scan], scan)
     assert by_folder.findings[0] == finding
+
+
+def test_the_reason_for_a_missing_image_names_the_folder_of_the_others(scan):
+    """The others are in ``../photos``, so that its own folder is not where to look for this one."""
+    write_images(scan.parent / "photos", ["a.png", "b.png"])
+    images = Images.find(["a.png", "b.png", "c.png"], [scan], scan / "cameras.txt")
+    assert images.file("c.png") is None
+    assert images.candidates(build, "xyz")[2].problem == "no image file in ../photos"
 
 
 def test_a_given_folder_is_searched_exclusively(scan):
     here = write_images(scan, ["a.png"])
     there = write_images(scan.parent / "photos" / "set", ["a.png"])
     write_images(scan.parent, ["b.png"])
-    images = Images(["a.png", "b.png"], [scan], scan / "cameras.txt", scan.parent / "photos" / "set")
+    images = Images.find(["a.png", "b.png"], [scan], scan / "cameras.txt", scan.parent / "photos" / "set")
     assert images.file("a.png") == there[0] != here[0] and images.file("b.png") is None
     assert images.candidates(build, "xy")[1].problem == "no image file in ../photos/set"
-    below = Images(["a.png"], [scan], scan / "cameras.txt", scan.parent / "photos")
+    below = Images.find(["a.png"], [scan], scan / "cameras.txt", scan.parent / "photos")
     assert below.file("a.png") == there[0] and below.findings == ()
     (scan.parent / "empty").mkdir()
-    none = Images(["b.png"], [scan], scan / "cameras.txt", scan.parent / "empty")
+    none = Images.find(["b.png"], [scan], scan / "cameras.txt", scan.parent / "empty")
     assert none.file("b.png") is None
     with pytest.raises(
         InputError,
         match=r"\Aimages \(--images\) must be a folder; got .*a\.png, which is not a folder\. Pass",
     ):
-        Images(["a.png"], [scan], scan / "cameras.txt", here[0])
-    assert Images([], [scan], scan / "cameras.txt").candidates(build, "") == []
+        Images.find(["a.png"], [scan], scan / "cameras.txt", here[0])
+    assert Images.find([], [scan], scan / "cameras.txt").candidates(build, "") == []
 
 
 def frames(*paths: str) -> list[CaptureFrame]:
