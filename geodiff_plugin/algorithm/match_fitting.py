@@ -200,8 +200,16 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Guid
     """
     stiff = error.new_full((1, len(error), 1, 1, 1), STIFF_SMOOTHNESS)
     tikhonov = error.new_full((1, len(error), 1, 1, 1), STIFF_TIKHONOV * STIFF_SMOOTHNESS)
-    observations = observed.residual, trusted, observed.noise
-    system = RobustSystem(*observations, error, config.outlier_sigma, observed.affinities, stiff, tikhonov)
+    system = RobustSystem(
+        data=observed.residual,
+        trusted=trusted,
+        noise=observed.noise,
+        error=error,
+        radius=config.outlier_sigma,
+        affinities=observed.affinities,
+        smoothness=stiff,
+        tikhonov=tikhonov,
+    )
     return solve_robust(system, REWEIGHTINGS + 1, SOLVER_STEPS)
 
 
@@ -283,13 +291,23 @@ def fit_depth(
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)
     trusted = _stiff(observed, observed.weight, error, config).weights
-    observations, levels = (observed.residual, trusted, observed.noise), _levels(error, config)
-    system = RobustSystem(*observations, None, RESIDUAL_CAUCHY, observed.affinities, *levels)
+    smoothness, tikhonov = _levels(error, config)
+    system = RobustSystem(
+        data=observed.residual,
+        trusted=trusted,
+        noise=observed.noise,
+        error=None,
+        radius=RESIDUAL_CAUCHY,
+        affinities=observed.affinities,
+        smoothness=smoothness,
+        tikhonov=tikhonov,
+    )
     total, _, determined = solve_robust(system, REWEIGHTINGS, SOLVER_STEPS, with_support=True)
     assert determined is not None  # with_support=True
     size = image_size(depth_m)
+    is_smaller = size[0] < target.size[0] or size[1] < target.size[1]
     change, support = (
-        F.interpolate(field, size, mode="bilinear", align_corners=False, antialias=size < target.size)
+        F.interpolate(field, size, mode="bilinear", align_corners=False, antialias=is_smaller)
         for field in (total, determined)
     )
     refined_m = depth_m.float() * torch.exp(-change)

@@ -155,6 +155,15 @@ def test_a_larger_map_is_changed_by_the_interpolated_correction():
     assert fit.support.shape == fit.depth_m.shape and fit.support.amin() >= 0 and fit.support.amax() <= 1
 
 
+@pytest.mark.parametrize("size", [(19, 29), (40, 10), (8, 60), (26, 20)])
+def test_a_correction_is_smoothed_before_it_is_downscaled_along_either_axis(size):
+    depth_m, target, image = scene()
+    smaller_m = F.interpolate(depth_m, size)
+    fit = fit_depth(smaller_m, target, image, torch.full((2, 1, 1, 1), 0.05), CONFIG)
+    change = F.interpolate(fit.log_change, size, mode="bilinear", antialias=True)
+    torch.testing.assert_close(fit.depth_m, smaller_m * torch.exp(-change))
+
+
 def test_the_priors_error_is_cross_validated_in_blocks_as_in_its_formula():
     """Three samples: many matches, few of them and none at all."""
     depth_m, target, image = scene(3)
