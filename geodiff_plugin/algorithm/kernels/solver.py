@@ -21,6 +21,7 @@ from torch import Tensor
 from geodiff_plugin._internal.kernels import launched_on
 from geodiff_plugin.algorithm.constants import COARSEST_SIDE, COARSEST_STEPS
 from geodiff_plugin.algorithm.systems import FieldSystem, RobustField, RobustSystem
+from geodiff_plugin.geometry import image_size
 
 #: Pixels per tile.
 TILE = 1024
@@ -37,6 +38,10 @@ FROM_ZEROS = tl.constexpr(0)
 FROM_FIELD = tl.constexpr(1)
 #: The initial iterate is the field of the next coarser grid.
 FROM_COARSER = tl.constexpr(2)
+#: Values of the standard deviation of the fitted map: none, one per sample, or one per pixel.
+NO_ERROR = tl.constexpr(0)
+PER_SAMPLE = tl.constexpr(1)
+PER_PIXEL = tl.constexpr(2)
 #: Number of work arrays of a field's size.
 WORK_ARRAYS = tl.constexpr(6)
 #: Number of partial sums per tile.
@@ -111,14 +116,11 @@ def _residual(data, field, x, shared, sample, held, p, n):
 
 @triton.jit
 def _cauchy_weight(weight, noise, error, radius, error_kind, residual, shared, sample, p, n):
-    """Compute the weight of observations in the next round.
-
-    ``error_kind`` is 0 without ``error``, 1 with one value per sample, 2 with one per pixel.
-    """
+    """Compute the weight of observations in the next round; ``error_kind`` is ``PER_PIXEL`` or another."""
     deviation = tl.load(noise + shared * n + p, p < n, 1.0)
-    of_pixel = error_kind // 2
+    of_pixel = (error_kind == PER_PIXEL).to(tl.int32)
     of_fitted = tl.load(error + shared * (1 + (n - 1) * of_pixel) + p * of_pixel, p < n, 0.0)
-    of_fitted = tl.where(error_kind > 0, of_fitted, 0.0)
+    of_fitted = tl.where(error_kind != NO_ERROR, of_fitted, 0.0)
     ratio = residual / (radius * tl.sqrt(deviation * deviation + of_fitted * of_fitted))
     return tl.load(weight + sample * n + p, p < n, 0.0) / (1.0 + ratio * ratio)
 
@@ -516,7 +518,7 @@ class _Counts(NamedTuple):
     steps: int
     given: bool  # whether ``start`` is given
     local: bool  # whether smoothness is given per pixel
-    error_kind: int = 0  # as in ``_cauchy_weight``
+    error_kind: int = NO_ERROR.value
 
 
 def _sizes(height: int, width: int, levels: bool) -> list[tuple[int, int]]:
@@ -561,16 +563,28 @@ def _of_batch(part: Tensor, samples: int, axis: int = 0) -> Tensor:
 def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) -> Tensor:
     """Run ``solver.solve_field`` with the kernel: the same steps on the same grids."""
     rhs = system.rhs.contiguous()
-    (batch, channels), field = rhs.shape[:2], torch.empty_like(rhs)
-    weight, across, down = (
-        _of_batch(system.weight, batch),
-        system.across.contiguous(),
-        system.down.contiguous(),
+    batch, channels = rhs.shape[:2]
+    field, unused = torch.empty_like(rhs), rhs
+    read = _Read(
+        data=rhs,
+        weight=_of_batch(system.weight, batch),
+        across=system.across.contiguous(),
+        down=system.down.contiguous(),
+        start=unused if start is None else start.contiguous(),
+        noise=unused,
+        error=unused,
+        smoothness=unused,
+        tikhonov=unused,
     )
-    first = rhs if start is None else start.contiguous()
-    counts = _Counts(channels, 1, 1, COARSEST_STEPS, steps, start is not None, local=False)
-    unused = rhs
-    read = _Read(rhs, weight, across, down, first, unused, unused, unused, unused)
+    counts = _Counts(
+        channels=channels,
+        passes=1,
+        rounds=1,
+        first_steps=COARSEST_STEPS,
+        steps=steps,
+        given=start is not None,
+        local=False,
+    )
     _launch(read, (field, unused, unused), counts)
     return field
 
@@ -578,16 +592,45 @@ def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) ->
 def solve_robust(system: RobustSystem, rounds: int, steps: int, *, with_support: bool = False) -> RobustField:
     """Run ``solver.solve_robust`` with the kernel."""
     data, trusted = system.data.contiguous(), system.trusted.contiguous()
-    parts, (across, down) = len(data), (_of_batch(link, len(data)) for link in system.affinities)
-    field, weights, *supports = trusted.new_empty(2 + with_support, *trusted.shape).unbind()
-    support = supports[0] if with_support else None
-    stiffness, tikhonov = (_of_batch(part, parts, axis=1) for part in (system.smoothness, system.tikhonov))
-    noise, error, error_kind = system.noise.contiguous(), data, 0
-    if system.error is not None:
-        error = _of_batch(system.error, parts)
-        error_kind = 1 if error.shape[-2:] == (1, 1) else 2
-    read = _Read(data, trusted, across, down, data, noise, error, stiffness, tikhonov)
-    local, channels = stiffness.shape[-2:] != (1, 1), 1 + with_support
-    counts = _Counts(channels, len(stiffness), rounds, COARSEST_STEPS, steps, False, local, error_kind)
-    _launch(read, (field, weights if support is None else support, weights), counts, system.radius)
+    parts = len(data)
+    across, down = (_of_batch(part, parts) for part in system.affinities)
+    smoothness, tikhonov = (_of_batch(part, parts, axis=1) for part in (system.smoothness, system.tikhonov))
+    error, error_kind = _error_input(system, unused=data)
+    read = _Read(
+        data=data,
+        weight=trusted,
+        across=across,
+        down=down,
+        start=data,  # unused
+        noise=system.noise.contiguous(),
+        error=error,
+        smoothness=smoothness,
+        tikhonov=tikhonov,
+    )
+    counts = _Counts(
+        channels=2 if with_support else 1,
+        passes=len(smoothness),
+        rounds=rounds,
+        first_steps=COARSEST_STEPS,
+        steps=steps,
+        given=False,
+        local=image_size(smoothness) != (1, 1),
+        error_kind=error_kind,
+    )
+    # One allocation for all results, as each is an operation on the host.
+    results = trusted.new_empty(3 if with_support else 2, *trusted.shape).unbind()
+    field, weights = results[:2]
+    support = results[2] if with_support else None
+    # The kernel writes the support only with two channels, so any tensor can take its place.
+    written = field, weights if support is None else support, weights
+    _launch(read, written, counts, system.radius)
     return RobustField(field, weights, support)
+
+
+def _error_input(system: RobustSystem, unused: Tensor) -> tuple[Tensor, int]:
+    """Return the standard deviation of the fitted map, or ``unused`` without one, and its kind."""
+    if system.error is None:
+        return unused, NO_ERROR.value
+    error = _of_batch(system.error, len(system.data))
+    kind = PER_SAMPLE if image_size(error) == (1, 1) else PER_PIXEL
+    return error, kind.value
