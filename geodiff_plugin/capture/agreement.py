@@ -167,19 +167,27 @@ def rendered(other: DepthFrame, frame: DepthFrame, values: np.ndarray) -> tuple[
     Z-buffered: the nearest point wins. Fills gaps of a pixel or two; 0 where there is no point.
     """
     row, column, z, inside = seen_in(other, frame)
-    height, width = frame.depth.shape
-    cells, nearest = (row * width + column)[inside], np.full(frame.depth.size, np.inf)
-    keep_nearest(torch.from_numpy(nearest), torch.from_numpy(cells), torch.from_numpy(z[inside]))
-    shown = z[inside] == nearest[cells]
-    maps = np.zeros(frame.depth.shape), np.zeros((*frame.depth.shape, *values.shape[2:]), values.dtype)
-    for target, source in zip(maps, (z, values), strict=True):
-        target[row[inside][shown], column[inside][shown]] = source[inside][shown]
+    row, column, z, values = row[inside], column[inside], z[inside], values[inside]
+    cells = row * frame.depth.shape[1] + column
+    nearest = torch.full((frame.depth.size,), torch.inf, dtype=torch.float64)
+    keep_nearest(nearest, torch.from_numpy(cells), torch.from_numpy(z))
+    is_nearest = z == nearest.numpy()[cells]
+    pixels = row[is_nearest], column[is_nearest]
+    depth = np.zeros(frame.depth.shape)
+    shown = np.zeros((*frame.depth.shape, *values.shape[1:]), values.dtype)
+    depth[pixels], shown[pixels] = z[is_nearest], values[is_nearest]
+    _fill_gaps(depth, shown)
+    return depth, shown
+
+
+def _fill_gaps(depth: np.ndarray, values: np.ndarray) -> None:
+    """Fill pixels with depth 0 from the pixels above, below, to the left and to the right, in this order."""
+    height, width = depth.shape
     for v, u in ((0, 1), (2, 1), (1, 0), (1, 2)):
-        gaps = maps[0] == 0
-        for target in maps:
-            around = np.pad(target, [(1, 1), (1, 1), (0, 0)][: target.ndim])
+        gaps = depth == 0
+        for target in (depth, values):
+            around = np.pad(target, [(1, 1), (1, 1), *[(0, 0)] * (target.ndim - 2)])
             target[gaps] = around[v : v + height, u : u + width][gaps]
-    return maps
 
 
 class _Vote(NamedTuple):
