@@ -321,27 +321,46 @@ def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: 
 
 
 def _measure(
-    ref: SampleRef, read: Any, method: Method, settings: Settings, priors: PriorCache, path: Path | None
+    ref: SampleRef,
+    read: Callable[[SampleRef], StereoSample],
+    method: Method,
+    settings: Settings,
+    priors: PriorCache,
+    path: Path | None,
 ) -> Record:
-    """Run one method on one sample and score it; seconds include only the method."""
+    """Run one method on one sample and score it; save its depth map to ``path``, if given."""
     sample, process = read(ref), {"process": Shard.of(None).index}
-    priors.evidence.take_spared_seconds()
-    start = time.perf_counter()
     try:
-        with PeakMemory(torch.device(settings.device)) as memory:
-            prediction = method.run(sample, settings, priors)
+        prediction, cost = _timed_run(method, sample, settings, priors)
     except NotApplicable as reason:
         return {"rectified": sample.rectified, "status": "not applicable", "reason": str(reason)} | process
-    seconds = time.perf_counter() - start + priors.evidence.take_spared_seconds()
-    cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
     scores = score(sample, prediction, DATASETS[sample.dataset].cap_m)
     scores["benchmark"] = benchmark_scores(sample, prediction)
-    notes: dict[str, Any] = {"notes": {"sample": dict(sample.notes), "method": dict(prediction.notes)}}
-    if path is not None and prediction.depth_m is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_depth_npy(path, prediction.depth_m)
-        notes["map"] = file_digest(path)
-    return {"rectified": sample.rectified, "status": "ok"} | cost | scores | notes | process
+    notes = {"notes": {"sample": dict(sample.notes), "method": dict(prediction.notes)}}
+    saved = {} if path is None or prediction.depth_m is None else {"map": _save_map(path, prediction.depth_m)}
+    return {"rectified": sample.rectified, "status": "ok"} | cost | scores | notes | saved | process
+
+
+def _timed_run(
+    method: Method, sample: StereoSample, settings: Settings, priors: PriorCache
+) -> tuple[Prediction, dict[str, float]]:
+    """Return the prediction of a method with its seconds and peak memory.
+
+    The seconds include work that the cache of evidence saved, as if the method had run alone.
+    """
+    priors.evidence.take_spared_seconds()  # sets them to zero
+    start = time.perf_counter()
+    with PeakMemory(torch.device(settings.device)) as memory:
+        prediction = method.run(sample, settings, priors)
+    seconds = time.perf_counter() - start + priors.evidence.take_spared_seconds()
+    return prediction, {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
+
+
+def _save_map(path: Path, depth_m: np.ndarray) -> str:
+    """Write a depth map and return the digest of its file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_depth_npy(path, depth_m)
+    return file_digest(path)
 
 
 def _has_map(cell: Item, record: Record) -> bool:
