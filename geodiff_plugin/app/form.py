@@ -161,12 +161,13 @@ def _file_note(path: str | None, camera_input: str, camera: str, name: str) -> s
         width, height = image_size(path, name)
     except InputError as error:
         return templates.note(error_on_page(error, [Path(path).parent]))
-    shows = "" if Path(path).suffix.lower() not in (".heic", ".heif") else "; browsers cannot display HEIC"
-    size = f'<div class="note">{width} x {height} pixels{shows}</div>'
+    is_heic = Path(path).suffix.lower() in (".heic", ".heif")
+    hidden = "; browsers cannot display HEIC" if is_heic else ""
+    notes = [f'<div class="note">{width} x {height} pixels{hidden}</div>']
     if camera_input == "images" and camera == "exif" and not states_focal_length(path):
         missing = Message("The file does not state its focal length.", "Choose your camera below.")
-        size += templates.note(missing)
-    return size
+        notes.append(templates.note(missing))
+    return "".join(notes)
 
 
 def _known_image(left: str | None, camera_input: str, scale_input: str) -> str:

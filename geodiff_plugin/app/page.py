@@ -318,20 +318,21 @@ class _Handlers:
         self.sessions.of(request.session_hash).uploads |= _uploads(paths)
 
     def restore(self, request: gr.Request, secret: str, by_phone: bool) -> dict[Any, Any]:
-        """Return the result that a tab had before a reload, if it has not expired.
-
-        A phone's visitors have no calibration, so its form begins with the images alone.
-        """
-        preset = {self.form.fields["camera_input"]: "images"} if by_phone else {}
+        """Return the result that a tab had before a reload, if it has not expired."""
         result = self.sessions.store.get(secret)
-        if result is None:
-            return {self.secret: "", **preset}
+        restored = {self.secret: ""} if result is None else self._restored(request, secret, result)
+        # A phone's visitors have no calibration, so its form begins with the images alone.
+        preset = {self.form.fields["camera_input"]: "images"} if by_phone else {}
+        return restored | preset
+
+    def _restored(self, request: gr.Request, secret: str, result: Result) -> dict[Any, Any]:
+        """Return the updates that show a result, and make it the one of the visitor's session."""
         self.sessions.store.end_in(secret, FORGET_AFTER_S)
         self.sessions.of(request.session_hash).secret = secret
         shown = {self.secret: secret, self.panels.paths: [str(path) for path in results.files_of(result)]}
         for html in drawn(result):
             shown |= self.on_panels(html)
-        return shown | preset
+        return shown
 
     def measure(self, request: gr.Request, secret: str, change: Any) -> dict[Any, Any]:
         """Change the pixels of the result on display by ``change``, and update what shows them.
