@@ -181,14 +181,15 @@ def flatness_table(records: Sequence[Record]) -> Table:
     values = tables.metric_values(records, "raw", "abs_rel")
     unchanged, rows = values.get("guided", {}), []
     for number in NUMBERS:
-        cells, largest = [], (0.0, "-")
+        means, changes = list[str](), list[tuple[float, str]]()
         for factor in (0.5, 2.0):
             changed = values.get(_at(number, factor), {})
             shared = [label for label in changed if label in unchanged]
-            cells.append(mean_cell([changed[label] for label in shared], 4))
-            largest = max([largest, *((abs(changed[label] - unchanged[label]), label) for label in shared)])
-        change = f"{cell(largest[0])} ({largest[1]})" if largest[0] else cell(0.0)
-        rows.append((f"`{number}`", f"{value_of(number, DEFAULT):g}", *cells, change))
+            means.append(mean_cell([changed[label] for label in shared], 4))
+            changes += [(abs(changed[label] - unchanged[label]), label) for label in shared]
+        largest, label = max(changes, default=(0.0, ""))
+        change = f"{cell(largest)} ({label})" if largest else cell(0.0)
+        rows.append((f"`{number}`", f"{value_of(number, DEFAULT):g}", *means, change))
     title = f"Each parameter of the default at half and twice its value, {count_of_pairs(len(unchanged))}"
     header = ("parameter", "value", "at half", "at twice", "largest change of a pair")
     note = f"Mean AbsRel; {mean_cell(unchanged.values(), 4)} with default values."
