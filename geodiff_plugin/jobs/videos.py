@@ -7,6 +7,7 @@ from pathlib import Path
 from geodiff_plugin._internal.checks import bad_value, raise_input_error
 from geodiff_plugin.findings import Finding
 from geodiff_plugin.formats import (
+    Offset,
     VideoFacts,
     estimate_offset,
     frame_interval,
@@ -28,24 +29,29 @@ def pair_videos(
         return _simultaneous(*facts, offset_s), ()
     videos = watch(left, "LEFT"), watch(right, "RIGHT")
     first, second = (video.facts for video in videos)
-    found = estimate_offset(*videos)
-    start_s = 0.0 if found is None else found.seconds
-    together = abs(start_s) < max(frame_interval(first.times), frame_interval(second.times)) / 2
-    if first.frames == second.frames and together:
+    estimated = estimate_offset(*videos)
+    interval_s = max(frame_interval(first.times), frame_interval(second.times))
+    together = estimated is None or abs(estimated.seconds) < interval_s / 2
+    if together and first.frames == second.frames:
         return _simultaneous(first, second, 0.0), ()
     counts = f"LEFT has {first.frames} frames and RIGHT {second.frames}"
-    if found is None:
+    if estimated is None:
         hint = "Pass --offset SECONDS, or trim both videos to the same time span."
         raise_input_error(f"{counts}, and their brightness does not show which are simultaneous. {hint}")
-    start_s = 0.0 if together else start_s
+    start_s = 0.0 if together else estimated.seconds
     pairs = _simultaneous(first, second, start_s)
+    return pairs, (_offset_finding(start_s, estimated, f"{counts}, of which {len(pairs)} are paired."),)
+
+
+def _offset_finding(start_s: float, estimated: Offset, counts: str) -> Finding:
+    """Return the finding on an estimated offset; ``counts`` is a sentence on the paired frames."""
     when = f"{abs(start_s):.3f} s {'after' if start_s > 0 else 'before'}" if start_s else "together with"
     sentence = (
         f"RIGHT is assumed to start {when} LEFT: the brightness of both then changes alike (correlation "
-        f"{found.correlation:.2f}, {found.without:.2f} without an offset). {counts}, of which {len(pairs)} "
-        "are paired. Pass --offset SECONDS if this is wrong."
+        f"{estimated.correlation:.2f}, {estimated.without:.2f} without an offset). {counts} Pass --offset "
+        "SECONDS if this is wrong."
     )
-    return pairs, (Finding("pairs.offset", sentence),)
+    return Finding("pairs.offset", sentence)
 
 
 def _simultaneous(left: VideoFacts, right: VideoFacts, offset_s: float) -> list[tuple[int, int]]:
