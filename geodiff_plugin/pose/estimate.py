@@ -216,6 +216,12 @@ def _five_points(tracks: Tracks) -> np.ndarray:
     return T
 
 
+def _consistent(tracks: Tracks, T: np.ndarray) -> np.ndarray:
+    """Return which matches fit a pose ``T (4, 4)`` with a point in front of the cameras, ``(N,)`` bool."""
+    poses = T[None]
+    return (residuals_px(tracks, poses)[0] < INLIER_PX) & (solve_inverse_depth(tracks, poses) > 0)
+
+
 def _second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: str) -> list[Finding]:
     """Detect a moving part of the scene, whose matches fit a second pose; reports it or raises an error.
 
@@ -225,10 +231,9 @@ def _second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: str
     rest = tracks.kept(residuals_px(tracks, T[None])[0] > LARGE_RESIDUAL_PX)
     if len(rest) < MIN_INLIERS:
         return []
-    second = _five_points(rest)
-    fit = (residuals_px(rest, second[None])[0] < INLIER_PX) & (solve_inverse_depth(rest, second[None]) > 0)
-    count = int(fit.sum())
-    if count < max(MIN_INLIERS, SECOND_MOTION_FRACTION * len(tracks), SECOND_OF_REST * len(rest)):
+    count = int(_consistent(rest, _five_points(rest)).sum())
+    enough = max(MIN_INLIERS, SECOND_MOTION_FRACTION * len(tracks), SECOND_OF_REST * len(rest))
+    if count < enough:
         return []
     hint = (
         "Something moved between the images, or a pattern repeats. Take both at the same time, or of a "
