@@ -9,7 +9,7 @@ import re
 import typing
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -231,16 +231,12 @@ def build_pipeline(cls: type[Any], layout: Layout, dtype: torch.dtype, **options
     ``options`` are constructor arguments that override the folder's; ``None`` is ignored.
     """
     arguments = {name: value for name, value in options.items() if value is not None}
-    annotated = _annotated(cls)
     for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:
-        entry = layout.index.get(name)
-        is_component = isinstance(entry, list) and entry[0] is not None
         if name in arguments:
             continue
-        if is_component or (name in annotated and (layout.folder / name).exists()):
-            arguments[name] = load_component(layout, name, _component_class(cls, layout, name), dtype)
-        elif entry is not None and not isinstance(entry, list):
-            arguments[name] = entry
+        value = _argument(cls, layout, name, dtype)
+        if value is not MISSING:
+            arguments[name] = value
         elif parameter.default is parameter.empty:
             bad_value(str(layout.folder), f"a folder with the component {name!r}", "no such component")
     try:
@@ -248,3 +244,13 @@ def build_pipeline(cls: type[Any], layout: Layout, dtype: torch.dtype, **options
     except (AttributeError, KeyError, TypeError) as error:  # this package's classes raise their own messages
         wrong = str(error)
     bad_value(str(layout.folder / "model_index.json"), f"the index of a {cls.__name__}", wrong, HINT)
+
+
+def _argument(cls: type[Any], layout: Layout, name: str, dtype: torch.dtype) -> Any:
+    """Return a component or option of a folder for a constructor's argument, or ``MISSING``."""
+    entry = layout.index.get(name)
+    is_listed = isinstance(entry, list) and entry[0] is not None
+    if is_listed or (name in _annotated(cls) and (layout.folder / name).exists()):
+        return load_component(layout, name, _component_class(cls, layout, name), dtype)
+    # A list names a component without a class, which its folder lacks.
+    return MISSING if entry is None or isinstance(entry, list) else entry

@@ -19,6 +19,10 @@ from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Ge
 TIMESTEP = 999
 #: One-hot task: [1, 0] predicts depth, [0, 1] reconstructs the image (used in training only).
 DEPTH_TASK = (1.0, 0.0)
+#: Length of the embedded task: sine and cosine of both numbers.
+TASK_SIZE = 4
+#: Input channels of the U-Net of Lotus-D, and of Lotus-G, which also sees the noisy latent.
+IMAGE_CHANNELS, WITH_NOISE = 4, 8
 
 
 class LotusPipeline(DepthDiffusionPipeline):
@@ -49,10 +53,10 @@ class LotusPipeline(DepthDiffusionPipeline):
             hint = "No Lotus config states it; the disparity versions have disparity in their name."
             bad_value("prediction_type", "'depth' or 'disparity'", repr(prediction_type), hint)
         channels, task = unet.config.in_channels, unet.config.projection_class_embeddings_input_dim
-        if channels not in (4, 8) or task != 4:
+        if channels not in (IMAGE_CHANNELS, WITH_NOISE) or task != TASK_SIZE:
             got = f"{channels} channels, {task}-d class embedding"
             bad_value("unet", "a Lotus U-Net (4 or 8 input channels, 4-d class embedding)", got)
-        self.sees_latents = channels == 8
+        self.sees_latents = channels == WITH_NOISE
         if not isinstance(scheduler, DirectScheduler):
             scheduler = DirectScheduler(timestep=TIMESTEP)
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
@@ -65,8 +69,8 @@ class LotusPipeline(DepthDiffusionPipeline):
         unet = layout.config("unet")
         return (
             unet.get("class_embed_type") == "projection"
-            and unet.get("projection_class_embeddings_input_dim") == 4
-            and unet.get("in_channels") in (4, 8)
+            and unet.get("projection_class_embeddings_input_dim") == TASK_SIZE
+            and unet.get("in_channels") in (IMAGE_CHANNELS, WITH_NOISE)
             and unet.get("_class_name") == "UNet2DConditionModel"
         )
 
