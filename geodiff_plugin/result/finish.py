@@ -231,16 +231,14 @@ def _measurable_m(evidence: Evidence, like: Tensor) -> Tensor | None:
     At that depth the noise of a good match is 10 % of the median pixel's shift. ``None`` without a second
     view.
     """
-    points = evidence.points
     if evidence.volume is None:
         return None
     shift_px = MATCH_NOISE_PX / RIGHT_WITHIN
     of_views_m = max(1.0 / view.inverse_depth_at(shift_px) for view in parallax_of(evidence.native))
-    return (
-        like.new_full((1,), of_views_m)
-        if points is None
-        else depth_span(points)[1].clamp_min(of_views_m)[None]
-    )
+    if evidence.points is None:
+        return like.new_full((1,), of_views_m)
+    _, of_points_m = depth_span(evidence.points)
+    return of_points_m.clamp_min(of_views_m)[None]
 
 
 def _mean(members: Sequence[Member], name: str) -> Tensor | None:

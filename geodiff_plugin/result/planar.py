@@ -31,6 +31,7 @@ from geodiff_plugin.result.constants import (
     MIN_VALUE_WEIGHT,
     SLOPES,
 )
+from geodiff_plugin.result.records import KnownMaps
 
 #: Smoothness of the slopes: they are similar over about the square root of its ratio to their own weight,
 #: pixels.
@@ -50,15 +51,6 @@ WEAK_PRIOR = 0.1
 STEPS = 8
 #: Minimum ratio of changed to original inverse depth.
 MIN_RATIO = 0.3
-
-
-class _Known(NamedTuple):
-    """Data support of a map by matches, ``(1, 1, h, w)`` each, on their grid."""
-
-    inverse: Tensor  # inverse depth, about 1
-    shape: Tensor  # ``known_shape``
-    data_weight: Tensor  # weight of values
-    weight: Tensor  # weight of changes of inverse depth
 
 
 class _Surface(NamedTuple):
@@ -107,39 +99,46 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, de
         Map like ``depth_m``.
     """
     log_depth = depth_m.float().log()
-    unit, good = log_depth.mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
+    mean_log_depth, prior_weight = log_depth.mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
     on_grid = _on(log_depth, target.size)
-    known = _Known(*_known_maps(target, on_grid, unit, good))
-    surface = _Surface(known.inverse, _affinities_of_walls(on_grid, denoised_m, left_01, good))
+    known = _known_maps(target, on_grid, mean_log_depth, prior_weight)
+    surface = _Surface(known.inverse, _affinities_of_walls(on_grid, denoised_m, left_01, prior_weight))
     targets = _Targets(_smoothed(surface, known.shape), known.data_weight)
     change = _fit_slopes(targets.slopes, surface, known.weight)
     log_decrease = _on(_log_decrease(surface, change), image_size(depth_m))
     log_decrease = log_decrease + _log_decrease_of_detail(
-        log_depth - log_decrease, unit, targets, left_01, good
+        log_depth - log_decrease, mean_log_depth, targets, left_01, prior_weight
     )
     return (depth_m * torch.exp(-log_decrease)).to(depth_m.dtype)
 
 
 @has_kernel(
     "result.kernels.planar.known_maps",
-    when=lambda target, log_depth, unit, good: target.deviation is not None,
+    when=lambda target, log_depth, mean_log_depth, prior_weight: target.deviation is not None,
 )
-def _known_maps(target: Matches, log_depth: Tensor, unit: Tensor, good: Tensor) -> tuple[Tensor, ...]:
-    """Compute the four maps of ``_Known``, in the order of its fields.
+def _known_maps(
+    target: Matches, log_depth: Tensor, mean_log_depth: Tensor, prior_weight: Tensor
+) -> KnownMaps:
+    """Compute the data support of a map by matches, with ``log_depth`` on their grid.
 
-    ``log_depth`` is on the grid of the matches. Inverse depths are relative to the log depth ``unit ()``;
-    ``good`` is as in ``_affinities_of_walls``.
+    Inverse depths are relative to the one at ``mean_log_depth ()``; ``prior_weight`` is as in
+    ``_affinities_of_walls``.
     """
-    inverse, shape = torch.exp(unit - log_depth), known_shape(target, torch.exp(-log_depth))
+    inverse = torch.exp(mean_log_depth - log_depth)
+    shape = known_shape(target, torch.exp(-log_depth))
     data_weight = _data_weight(shape)
-    return inverse, shape, data_weight, _relative(data_weight + MIN_VALUE_WEIGHT * good, inverse)
+    weight = _relative(data_weight + MIN_VALUE_WEIGHT * prior_weight, inverse)
+    return KnownMaps(inverse, shape, data_weight, weight)
 
 
 def _affinities_of_walls(
-    log_depth: Tensor, denoised_m: Tensor, left_01: Tensor, good: Tensor
+    log_depth: Tensor, denoised_m: Tensor, left_01: Tensor, prior_weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Compute affinities on the grid of the matches; ``good`` is the factor on the weight of its values."""
-    edge = (DEPTH_EDGE / good.sqrt()).clamp_min(DETAIL_EDGE)
+    """Compute affinities on the grid of the matches.
+
+    ``prior_weight`` is the factor on the weight of the prior's values.
+    """
+    edge = (DEPTH_EDGE / prior_weight.sqrt()).clamp_min(DETAIL_EDGE)
     guide = _guide(left_01, image_size(log_depth))
     fitted = _affinities(log_depth, guide, edge)
     denoised = _affinities(log_depth_at(denoised_m, image_size(log_depth)), guide, DENOISED_EDGE)
@@ -147,15 +146,16 @@ def _affinities_of_walls(
 
 
 def _log_decrease_of_detail(
-    log_depth: Tensor, unit: Tensor, targets: _Targets, left_01: Tensor, good: Tensor
+    log_depth: Tensor, mean_log_depth: Tensor, targets: _Targets, left_01: Tensor, prior_weight: Tensor
 ) -> Tensor:
     """Solve the second problem on the filter's grid and return the decrease of log depth ``(1, 1, H, W)``."""
     (height, width), size = image_size(targets.data_weight), grid_of_rows(image_size(log_depth))
     on_grid = _on(log_depth, size)
-    surface = _Surface(torch.exp(unit - on_grid), _affinities(on_grid, _guide(left_01, size), DETAIL_EDGE))
+    affinities = _affinities(on_grid, _guide(left_01, size), DETAIL_EDGE)
+    surface = _Surface(torch.exp(mean_log_depth - on_grid), affinities)
     # A slope is the change between neighbouring pixels, and the pixels of this grid are smaller.
     smaller = constant_like(targets.slopes, width / size[1], height / size[0]).view(2, 1, 1, 1)
-    weight = _relative(_on(targets.data_weight, size) + MIN_DETAIL_WEIGHT * good, surface.inverse)
+    weight = _relative(_on(targets.data_weight, size) + MIN_DETAIL_WEIGHT * prior_weight, surface.inverse)
     change = _fit_slopes(smaller * _on(targets.slopes, size), surface, weight, torch.zeros_like(weight))
     return _on(_log_decrease(surface, change), image_size(log_depth))
 

@@ -1,4 +1,4 @@
-"""Inputs of the weighted median filter and of the confidence: records shared by several stages."""
+"""Records of the median filter, the confidence and the planar regularization, shared with their kernels."""
 
 from __future__ import annotations
 
@@ -27,3 +27,12 @@ class ConfidenceFeatures(NamedTuple):
     residual: Tensor  # mean residual of surrounding matches, planes
     change: Tensor  # mean change of log depth since denoising in the window; larger with fewer matches
     discontinuity: Tensor  # range of log depth in the neighbourhood
+
+
+class KnownMaps(NamedTuple):
+    """Data support of a map by matches, ``(1, 1, h, w)`` each, on their grid."""
+
+    inverse: Tensor  # inverse depth, about 1
+    shape: Tensor  # ``known_shape``
+    data_weight: Tensor  # weight of values
+    weight: Tensor  # weight of changes of inverse depth

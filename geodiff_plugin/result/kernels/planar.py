@@ -12,6 +12,7 @@ from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.constants import FAR_PLANES, MIN_DEVIATION
 from geodiff_plugin.matching.kernels.windows import TILE, mean_precision, tile_places, tiles
 from geodiff_plugin.result import constants
+from geodiff_plugin.result.records import KnownMaps
 
 #: Pixels per program.
 BLOCK = 512
@@ -30,8 +31,8 @@ _FAR_PLANES = tl.constexpr(FAR_PLANES)
     do_not_specialize_on_alignment=["deviation", "confidence", "shape", "held", "weight"],
 )
 def known_kernel(
-    deviation, confidence, log_depth, step, unit, good, inverse, shape, held, weight, height, width,
-    ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+    deviation, confidence, log_depth, step, mean_log_depth, prior_weight, inverse, shape, held, weight,
+    height, width, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Compute ``planar._known_maps``. Grid: tiles down, tiles across."""
     p, inside = tile_places(height, width, ROWS, COLUMNS)
@@ -40,23 +41,23 @@ def known_kernel(
     planes = tl.exp(-away) / tl.load(step)
     known = tl.minimum(known * tl.minimum(planes / _FAR_PLANES, 1.0), 1.0)
     value_weight = tl.minimum(known * known / tl.maximum(1.0 - known, 1e-6), _MAX_VALUE_WEIGHT)
-    about_one = tl.exp(tl.load(unit) - away)
+    about_one = tl.exp(tl.load(mean_log_depth) - away)
     least = tl.maximum(about_one, _MIN_INVERSE)
     tl.store(inverse + p, about_one, inside)
     tl.store(shape + p, known, inside)
     tl.store(held + p, value_weight, inside)
-    tl.store(weight + p, (value_weight + tl.load(good) * _MIN_VALUE_WEIGHT) / (least * least), inside)
+    tl.store(weight + p, (value_weight + tl.load(prior_weight) * _MIN_VALUE_WEIGHT) / (least * least), inside)
 
 
-def known_maps(target: Matches, log_depth: Tensor, unit: Tensor, good: Tensor) -> tuple[Tensor, ...]:
+def known_maps(target: Matches, log_depth: Tensor, mean_log_depth: Tensor, prior_weight: Tensor) -> KnownMaps:
     """Run ``planar._known_maps`` with a kernel, for matches with a deviation."""
     assert target.deviation is not None
     maps = log_depth.new_empty(4, *log_depth.shape).unbind()
     launched_on(log_depth, known_kernel[tiles(target.size)])(
         target.deviation.contiguous(), target.confidence.contiguous(), log_depth.contiguous(),
-        target.plane_step, unit, good, *maps, *target.size, ROWS=TILE[0], COLUMNS=TILE[1],
+        target.plane_step, mean_log_depth, prior_weight, *maps, *target.size, ROWS=TILE[0], COLUMNS=TILE[1],
     )  # fmt: skip
-    return maps
+    return KnownMaps(*maps)
 
 
 @triton.jit
