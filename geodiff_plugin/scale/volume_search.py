@@ -25,6 +25,8 @@ from geodiff_plugin.scale.space import SPACES, DepthRange
 
 #: Maximum number of pixels in the search; each costs one lookup.
 SAMPLES = 6000
+#: Fraction of the end of a range within which a depth touches it.
+EDGE = 0.02
 
 
 class Groups(NamedTuple):
@@ -110,9 +112,9 @@ def search_scale(
     values = F.interpolate(x.float(), volume.size, mode="bilinear", align_corners=False).flatten(1)[:, at]
     in_use = None if current is None else current[:2]
     near_m, far_m = _best_range(volume, values, at, space, (low, high), in_use)
-    on_edge = far_m >= high * 0.98
+    on_edge = far_m >= high * (1 - EDGE)
     if depth_range is not None:  # the volume's near end is nearer than any match
-        on_edge |= near_m <= low * 1.02
+        on_edge |= near_m <= low * (1 + EDGE)
     return DepthRange(near_m, far_m, on_edge)
 
 

@@ -73,12 +73,16 @@ def letterbox_fraction(greys: Sequence[np.ndarray]) -> float:
     is curved, or wider at one side.
     """
     for horizontal in (False, True):
-        widths = []
-        for grey in greys:
-            lines = grey if horizontal else grey.T
-            minima, maxima = lines.min(1), lines.max(1)
-            widths.append(_bar_fraction(int(lines[0, 0]), minima, maxima))
-            widths.append(_bar_fraction(int(lines[-1, 0]), minima[::-1], maxima[::-1]))
-        if MIN_WIDTH <= min(widths) <= max(widths) <= min(MAX_WIDTH, min(widths) + MAX_DIFFERENCE):
-            return max(widths)
+        widths = [width for grey in greys for width in _bar_widths(grey if horizontal else grey.T)]
+        narrowest, widest = min(widths), max(widths)
+        if narrowest >= MIN_WIDTH and widest <= min(MAX_WIDTH, narrowest + MAX_DIFFERENCE):
+            return widest
     return 0.0
+
+
+def _bar_widths(lines: np.ndarray) -> tuple[float, float]:
+    """Return the width of the bars before and after the content of lines ``(N, M)``, as fractions of N."""
+    minima, maxima = lines.min(1), lines.max(1)
+    first = _bar_fraction(int(lines[0, 0]), minima, maxima)
+    last = _bar_fraction(int(lines[-1, 0]), minima[::-1], maxima[::-1])
+    return first, last
