@@ -26,7 +26,7 @@ from geodiff_plugin.formats import undistorted
 from geodiff_plugin.matching import clean
 from geodiff_plugin.matching.matches import RELIABLE, read_above
 from geodiff_plugin.matching.repetition import if_repeated, with_repetition
-from geodiff_plugin.matching.rows import rectified_images
+from geodiff_plugin.matching.rows import first_rectified_pair
 from geodiff_plugin.pose.fit import measure_fit, posed_greys
 from geodiff_plugin.scale.points import reliable_matches
 from geodiff_plugin.trust import FactSheet, MatchesStage, measure
@@ -127,7 +127,7 @@ def prepare_evidence(native: PosedViews, points: Tensor | None, config: Guidance
         known_points, outside = matching.points_to_matches(points, native.left.camera, grid.size)
     if native.rights and (config.search == "volume" or needs_matches):
         # The rows are sent to the CPU during the sweep, and matched once its matches are known.
-        rgb_images = rectified_images(native) if needs_matches and config.refine_edges else None
+        rgb_images = first_rectified_pair(native) if needs_matches and config.refine_edges else None
         row_tasks = None if rgb_images is None else RowTasks(rgb_images, native.size)
         volume = matching.build_cost_volume(native, depth_range=config.depth_range, config=config)
         if needs_matches:

@@ -62,9 +62,11 @@ def jump_penalties(grey: Tensor, axes: Sequence[tuple[int, int]]) -> Tensor:
     difference = grey.new_zeros(len(axes), *grey.shape)
     height, width = grey.shape
     for of_axis, (down, across) in zip(difference, axes, strict=True):
-        left, right = max(across, 0), max(-across, 0)
-        later, before = grey[down:, left : width - right], grey[: height - down, right : width - left]
-        of_axis[down:, left : width - right] = (later - before).abs()
+        # Overlapping crops: the pixels that have a previous one, and these previous ones.
+        to_right, to_left = max(across, 0), max(-across, 0)
+        here = slice(down, height), slice(to_right, width - to_left)
+        previous = slice(0, height - down), slice(to_left, width - to_right)
+        of_axis[here] = (grey[here] - grey[previous]).abs()
     limit = JUMP_PENALTY / (1.0 + difference / JUMP_CONTRAST)
     limit = limit.clamp_min(2.0 * STEP_PENALTY).nan_to_num(0.0)
     return (COST_LEVELS * limit).round().to(torch.int16)

@@ -130,19 +130,16 @@ def _row_shifts(
     return shift, shift >= MIN_SHIFT_PX  # OpenCV puts unmatched pixels one pixel before the search
 
 
-def rectified_images(native: PosedViews) -> RowImages | None:
+def first_rectified_pair(native: PosedViews) -> RowImages | None:
     """Return the left image and the first view of the same size that is rectified with it, if any.
 
     ``native`` has the image and its right views at native size.
     """
-    same_size = (view for view in native.rights if view.size == native.size)
-    left = native.left
-    rectified = (v for v in same_size if is_rectified(left.camera, v.camera, v.T_right_from_left))
-    right = next(rectified, None)
-    if right is None:
-        return None
-    size = grid_of_rows(native.size)
-    return row_images(left.resized(size), right.resized(size))
+    left, size = native.left, grid_of_rows(native.size)
+    for right in native.rights:
+        if right.size == native.size and is_rectified(left.camera, right.camera, right.T_right_from_left):
+            return row_images(left.resized(size), right.resized(size))
+    return None
 
 
 def row_images(left: View, right: View) -> RowImages:

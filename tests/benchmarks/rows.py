@@ -26,7 +26,7 @@ from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.matching import match_volume, sweep_planes
 from geodiff_plugin.matching.census import grey
-from geodiff_plugin.matching.rows import RowImages, grid_of_rows, rectified_images
+from geodiff_plugin.matching.rows import RowImages, first_rectified_pair, grid_of_rows
 from tests.tiny import rows_of
 
 __all__ = ["Score", "compare", "main"]
@@ -82,7 +82,7 @@ MATCHERS: dict[str, Callable[[RowImages, PosedViews, float], tuple[Tensor, Tenso
 def compare(sample: StereoSample) -> dict[str, Score]:
     """The scores of both matchers on a rectified pair with ground truth."""
     views, depth_m = _on_grid(sample)
-    images = rectified_images(views)
+    images = first_rectified_pair(views)
     assert images is not None
     known = depth_m > 0
     true_px = np.where(known, images.shift_px(1.0) / np.where(known, depth_m, 1.0), 0.0)

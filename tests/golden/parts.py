@@ -44,7 +44,7 @@ from geodiff_plugin.matching.build import inverse_pose_preferred
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.reflections import reject_reflections
-from geodiff_plugin.matching.rows import rectified_images
+from geodiff_plugin.matching.rows import first_rectified_pair
 from geodiff_plugin.pose.estimate import find_scale
 from geodiff_plugin.pose.refine import Displacement, fit_displacement, refined_scale, warp_image
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
@@ -415,7 +415,7 @@ def finished() -> dict[str, object]:
     for e in (0.03, 0.12):
         error = torch.full((1, 1, 1, 1), e)
         native = posed._replace(rights=(*posed.rights, rectified))
-        rows = RowTasks(rectified_images(native), native.size).match(target, None).result()
+        rows = RowTasks(first_rectified_pair(native), native.size).match(target, None).result()
         evidence = Evidence(native, native, None, target, rows=rows.matches)
         voted_m = filter_depth(depth_m, evidence, target, known_fraction(target), error)
         result[f"voted_{e}"] = (voted_m / depth_m).log()

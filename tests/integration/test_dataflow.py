@@ -28,7 +28,8 @@ PATH = {
     "pose.tracks": ("grey_views", "sparse_tracks"),  # PosedViews
     "trust.order_ambiguity": ("OrderAmbiguity.of_tracks",),  # Tracks
     "matching.build": ("to_grid", "build_cost_volume"),  # PosedViews, CostVolume
-    "matching.rows": ("rectified_images", "match_rows", "row_matches"),  # PosedViews, RowImages, RowMatches
+    # PosedViews, RowImages, RowMatches
+    "matching.rows": ("first_rectified_pair", "match_rows", "row_matches"),
     "matching.planes": ("parallax_of", "even_planes"),  # PosedViews
     "matching.sweep": ("sweep_planes",),  # PosedViews, CostVolume
     "matching.alignment": ("align_view",),  # View, AlignedView

@@ -34,8 +34,8 @@ from geodiff_plugin.evidence.plan import RowTasks
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, known_fraction, reject_reflections, rows
 from geodiff_plugin.matching.rows import (
+    first_rectified_pair,
     half_occlusions,
-    rectified_images,
     row_images,
     with_occluded,
 )
@@ -767,7 +767,7 @@ def scene(side: int = 1, doffs: float = 0.0) -> tuple[Tensor, Tensor, View]:
 def voted(map_m: Tensor, left: Tensor, views, matched_m: Tensor, confidence: float, error=0.4, *spacing):
     target = Matches(1.0 / matched_m, torch.full_like(matched_m, confidence), torch.full((1,), 2e-3))
     native = PosedViews(view_of(left[0], CAMERA), tuple(views))
-    images = rectified_images(native)
+    images = first_rectified_pair(native)
     rows = images and RowTasks(images, native.size).match(target, None).result().matches
     evidence = Evidence(native, native, None, target, rows=rows)
     return filter_depth(

@@ -274,7 +274,7 @@ def matched(monkeypatch):
     monkeypatch.setattr(
         module, "matching", SimpleNamespace(**{n: note(n, value) for n, value in parts.items()})
     )
-    monkeypatch.setattr(module, "rectified_images", note("rectified_images", "pictures"))
+    monkeypatch.setattr(module, "first_rectified_pair", note("first_rectified_pair", "pictures"))
 
     def searched(found, of_volume):
         assert found is matches and of_volume is volume
@@ -290,7 +290,7 @@ def matched(monkeypatch):
 
 
 NATIVE = PosedViews(view_of(LEFT, K), VIEWS)
-ROW_PARTS = {"rectified_images", "RowTasks", "RowTasks.match"}
+ROW_PARTS = {"first_rectified_pair", "RowTasks", "RowTasks.match"}
 EVERYTHING = {
     "to_grid",
     "build_cost_volume",
@@ -312,7 +312,7 @@ def test_views_and_points_become_evidence(matched):
     assert given["build_cost_volume"] == ((NATIVE,), {"depth_range": (0.7, 60.0), "config": config})
     assert given["match_volume"] == ((matched.volume,), {})
     assert given["measure"] == ((MatchesStage(NATIVE, matched.matches),), {})
-    assert given["rectified_images"] == ((NATIVE,), {})
+    assert given["first_rectified_pair"] == ((NATIVE,), {})
     assert given["RowTasks"] == (("pictures", SIZE), {})
     assert given["RowTasks.match"] == ((matched.matches, matched.points), {})
     assert found.native is NATIVE and found.grid is matched.grid and found.volume is matched.volume
@@ -355,7 +355,7 @@ def test_only_what_the_configuration_needs_is_made(matched, parameters, views, m
 
 
 def test_no_rows_are_matched_of_a_pair_that_is_not_rectified(matched, monkeypatch):
-    monkeypatch.setattr(module, "rectified_images", lambda native: None)
+    monkeypatch.setattr(module, "first_rectified_pair", lambda native: None)
     plan = prepare_evidence(NATIVE, POINTS, DEFAULT)
     assert plan.rows is None and matched.given.keys() == EVERYTHING - ROW_PARTS | {"points_to_matches"}
 

@@ -14,9 +14,9 @@ from geodiff_plugin.matching.gaps import find_gaps
 from geodiff_plugin.matching.matches import HalfOcclusions, Matches
 from geodiff_plugin.matching.rows import (
     RowMatches,
+    first_rectified_pair,
     half_occlusions,
     match_rows,
-    rectified_images,
     row_images,
     row_matches,
     with_occluded,
@@ -177,7 +177,7 @@ def test_large_images_are_matched_on_a_smaller_grid_with_its_cameras(monkeypatch
     assert rows.grid_of_rows((832, 1248)) == (632, 949)
     left, view = scene(1, -6)
     monkeypatch.setattr(rows, "MAX_PIXELS", 50 * 110)
-    images = rectified_images(PosedViews(left, (view,)))
+    images = first_rectified_pair(PosedViews(left, (view,)))
     assert images.levels.shape == (2, 50, 110)
     assert images.focal_px == pytest.approx(FOCAL / 2) and images.infinity_px == pytest.approx(-3.0)
     found = rows_of(images, 9.0)
@@ -192,12 +192,12 @@ def test_the_first_view_that_is_rectified_and_of_the_left_image_size_is_matched(
     turned = view._replace(T_right_from_left=ref.right_from_left((0.0, 3.0, 0.0), (0.3, 0.0, 0.0)))
     smaller = view._replace(image_01=view.image_01[:, :, 1:])
     farther = view._replace(T_right_from_left=view.T_right_from_left * np.array([1.0, 1, 1, 3]))
-    images = rectified_images(PosedViews(left, (turned, smaller, view, farther)))
+    images = first_rectified_pair(PosedViews(left, (turned, smaller, view, farther)))
     assert abs(float(images.shift_m)) == pytest.approx(BASELINE_M) and images.infinity_px == -6
-    other = rectified_images(PosedViews(left, (smaller, farther, view)))
+    other = first_rectified_pair(PosedViews(left, (smaller, farther, view)))
     assert abs(float(other.shift_m)) == pytest.approx(3 * BASELINE_M)
     for views in ((), (turned,), (smaller,), (turned, smaller)):
-        assert rectified_images(PosedViews(left, views)) is None
+        assert first_rectified_pair(PosedViews(left, views)) is None
 
 
 def test_a_pair_of_which_nothing_matches_has_no_shift():
