@@ -26,7 +26,9 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 def rendered_scan(folder: Path, size: tuple[int, int], frames: int) -> dict[str, np.ndarray]:
     """Write a transforms.json with images; return ground-truth depth by frame."""
     sequence = render_sequence(3, frames, "room", size)
-    rng, said, ground_truth = np.random.default_rng(0), [], {}
+    rng = np.random.default_rng(0)
+    said = []
+    ground_truth = {}
     for i, (view, pose) in enumerate(zip(sequence.lefts, sequence.T_world_from_left, strict=True)):
         image = (view.image_01.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
         Image.fromarray(image).save(folder / f"frame{i}.png")

@@ -126,7 +126,8 @@ def complete_by_lora(
     padded, _, _ = pipe.image_processor.preprocess(image, resolution, device=device, dtype=pipe.dtype)
     points_m = points_m.to(device)
     known = points_m > 0
-    target, size = points_m[known], tuple(points_m.shape)
+    target = points_m[known]
+    size = tuple(points_m.shape)
     weights = [p for m in (pipe.transformer, pipe.vae) for p in m.parameters()]
     flags = [p.requires_grad for p in weights]
     for parameter in weights:
@@ -274,10 +275,12 @@ def main(argv: list[str] | None = None) -> None:
 
     resolution = TINY_RESOLUTION
     if options.prior is None:
-        pipe, name = tiny_marigold_v2().to(options.device), "tiny Marigold V2 with random weights"
+        pipe = tiny_marigold_v2().to(options.device)
+        name = "tiny Marigold V2 with random weights"
     else:
         half = torch.float32 if options.device == "cpu" else torch.bfloat16
-        pipe, name = load_prior(options.prior, device=options.device, dtype=half), options.prior
+        pipe = load_prior(options.prior, device=options.device, dtype=half)
+        name = options.prior
         if not isinstance(pipe, MarigoldV2Pipeline):
             bad_value("--prior", "a Marigold V2 in log depth", options.prior)
         resolution = pipe.default_processing_resolution

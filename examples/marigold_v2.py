@@ -46,7 +46,8 @@ def tiny_marigold_v2(seed: int = 0, space: str = "log") -> MarigoldV2Pipeline:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         transformer = QwenImageTransformer2DModel(**TINY_TRANSFORMER).eval()
-        vae, prompt = AutoencoderKLQwenImage(**TINY_VAE).eval(), FixedPrompt(5, 16)
+        vae = AutoencoderKLQwenImage(**TINY_VAE).eval()
+        prompt = FixedPrompt(5, 16)
         torch.nn.init.normal_(prompt.embedding)
         torch.nn.init.normal_(
             vae.decoder.conv_out.weight, std=0.3

@@ -75,7 +75,8 @@ def write_transforms(network: str, predictions: Path, images: Path, padded: bool
     poses, intrinsics, world_to_camera = NETWORKS[network]
     with np.load(predictions) as file:
         data = dict(file)
-    E, Ks = camera_to_world(data[poses], world_to_camera), data[intrinsics].reshape(-1, 3, 3)
+    E = camera_to_world(data[poses], world_to_camera)
+    Ks = data[intrinsics].reshape(-1, 3, 3)
     paths = sorted(path for path in images.iterdir() if path.suffix.lower() in SUFFIXES)
     if len(paths) != len(E):
         raise SystemExit(
@@ -104,7 +105,8 @@ def stub(
 ) -> Path:
     """Write a synthetic prediction of a network next to three images."""
     poses, intrinsics, world_to_camera = NETWORKS[network]
-    rng, E = np.random.default_rng(0), np.tile(np.eye(4), (3, 1, 1))
+    rng = np.random.default_rng(0)
+    E = np.tile(np.eye(4), (3, 1, 1))
     E[:, 0, 3] = 0.1, 0.2, 0.4
     for number in range(3):
         rgb = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)

@@ -55,7 +55,8 @@ def main(argv: list[str] | None = None) -> None:
         generator=torch.Generator("cpu").manual_seed(0),
     )
 
-    depth_m, ground_truth_m = out.prediction[0, ..., 0], pair.left.depth_m[0].numpy()
+    depth_m = out.prediction[0, ..., 0]
+    ground_truth_m = pair.left.depth_m[0].numpy()
     known = pair.left.valid[0].numpy()
     error = np.abs(depth_m - ground_truth_m)[known] / ground_truth_m[known]
     print(

@@ -129,7 +129,8 @@ def prove(name: str, pairs: list[Pair], device: torch.device, dtype: torch.dtype
         return Proof(name, absent=str(error))
     pipe.set_progress_bar_config(disable=True)
     proof = Proof(name, facts=(recognised.key, recognised.licence, weights_hash(recognised.layout)))
-    space, results = prior_of(pipe).space, {}
+    space = prior_of(pipe).space
+    results = {}
 
     def call(key: str, pair: Pair, **reported: Any) -> float:
         seeded = torch.Generator(device).manual_seed(seed)
@@ -200,7 +201,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")
     parser.add_argument("--out", type=Path, default=Path("proof.md"))
     options = parser.parse_args(argv)
-    device, dtype = pick_device(options.device), getattr(torch, options.dtype)
+    device = pick_device(options.device)
+    dtype = getattr(torch, options.dtype)
     pairs = list(pairs_of(options.data, options.pairs))
     proofs = []
     for name in options.priors or PUBLISHED:

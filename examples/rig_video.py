@@ -39,7 +39,8 @@ def rendered_rig(count: int) -> tuple[list[tuple[Any, Any]], Rig]:
     """Render frames of a rig that moves through a room; return them and its calibration."""
     sequence = render_sequence(3, count, "room", (144, 192))
     frames = zip(sequence.lefts, sequence.rights, strict=True)
-    camera, pairs = Camera(sequence.K.numpy()), [(left.image_01, right.image_01) for left, right in frames]
+    camera = Camera(sequence.K.numpy())
+    pairs = [(left.image_01, right.image_01) for left, right in frames]
     return pairs, Rig(camera, camera, sequence.E.numpy())
 
 
@@ -64,7 +65,8 @@ def main(argv: list[str] | None = None) -> None:
 
     if options.files:
         *videos, calib = options.files
-        frames, rig = read_frames(*videos, options.frames), read_calibration(calib)
+        frames = read_frames(*videos, options.frames)
+        rig = read_calibration(calib)
     else:
         frames, rig = rendered_rig(options.frames)
 

@@ -45,7 +45,9 @@ def main(argv: list[str] | None = None) -> None:
         points, K = np.load(options.files[1]), np.loadtxt(options.files[2])
     else:
         pair = read_demo_pair()
-        image, K, ground_truth_m = pair.left, pair.rig.K_left, pair.depth_m
+        image = pair.left
+        K = pair.rig.K_left
+        ground_truth_m = pair.depth_m
         chosen = np.random.default_rng(0).choice(np.flatnonzero(pair.valid), 500, replace=False)
         points = np.zeros_like(ground_truth_m)
         points.flat[chosen] = ground_truth_m.flat[chosen]

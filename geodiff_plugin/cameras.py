@@ -317,7 +317,8 @@ def is_rectified(left: Camera, right: Camera, T_right_from_left: np.ndarray) -> 
 
 def _undistort(px: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
     """Undistort pixels ``(..., 2)`` as in ``Camera.undistorted_px``."""
-    taken, K = np.asarray(px, np.float64).reshape(-1, 1, 2), np.asarray(K, np.float64)
+    taken = np.asarray(px, np.float64).reshape(-1, 1, 2)
+    K = np.asarray(K, np.float64)
     if not len(taken):
         return taken.reshape(px.shape)
     if lens.model in ("opencv", "fisheye"):
@@ -345,7 +346,8 @@ def _undistort_by_opencv(taken: np.ndarray, K: np.ndarray, lens: Distortion) -> 
 
 def _distort(flat: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
     """Project rays ``(..., 2)``, x and y at z = 1, to pixels ``(..., 2)`` of the distorted image."""
-    rays, K = np.asarray(flat, np.float64).reshape(-1, 2), np.asarray(K, np.float64)
+    rays = np.asarray(flat, np.float64).reshape(-1, 2)
+    K = np.asarray(K, np.float64)
     if not len(rays):
         return rays.reshape(flat.shape)
     import cv2
@@ -354,7 +356,8 @@ def _distort(flat: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
     if lens.model == "fisheye":
         px = cv2.fisheye.distortPoints(rays[:, None], K, coefficients)
     elif lens.model == "opencv":
-        points, none = np.c_[rays, np.ones(len(rays))], np.zeros(3)
+        points = np.c_[rays, np.ones(len(rays))]
+        none = np.zeros(3)
         px = cv2.projectPoints(points, none, none, K, coefficients)[0]
     else:
         px = _colmap_camera(K, lens).img_from_cam(np.c_[rays, np.ones(len(rays))]) - 0.5

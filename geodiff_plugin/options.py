@@ -237,7 +237,8 @@ class RunOptions(PriorOptions):
             missing, given = ("near", "far") if self.near is None else ("far", "near")
             raise_input_error(f"{names[given]} needs {names[missing]}. Give both in metres.")
         if self.near is not None and self.far is not None and self.near >= self.far:
-            got, hint = f"{self.near:g} and {self.far:g}", "Both are depths in metres."
+            got = f"{self.near:g} and {self.far:g}"
+            hint = "Both are depths in metres."
             bad_value(names["near"], f"less than {names['far']}", got, hint)
         if self.resolution is not None and (self.resolution % 8 or 0 < self.resolution < 32):
             hint = f"Try {max(32, round(self.resolution / 8) * 8)}."

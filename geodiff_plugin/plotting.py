@@ -172,9 +172,14 @@ class _Legend:
 
 def _draw(legend: _Legend) -> np.ndarray:
     """Draw a legend, ``(H, W, 3)`` uint8."""
-    high, size, font = legend.height, legend.letters, _font(legend.letters)
-    left, right = size // 2, size // 2 + max(14, high // 24)
-    top, bottom, line = 2 * size, high - size * (3 if legend.unknown else 1), max(1, size // 12)
+    high = legend.height
+    size = legend.letters
+    font = _font(legend.letters)
+    left = size // 2
+    right = size // 2 + max(14, high // 24)
+    top = 2 * size
+    bottom = high - size * (3 if legend.unknown else 1)
+    line = max(1, size // 12)
     sheet = Image.new("RGB", (right + 5 * size, high), "white")
     drawn = ImageDraw.Draw(sheet)
     ramp = Image.fromarray(_table(legend.colours)[SHADES - 1 :: -1, None])
@@ -287,14 +292,17 @@ def grid(
     rgb_images = [as_rgb_image(image) for image in images]
     if not rgb_images or len(titles) != len(rgb_images):
         bad_value("images", "one or more, each with a title", f"{len(rgb_images)}, {len(titles)} titles")
-    columns, head = columns or min(len(rgb_images), 4), 24
+    columns = columns or min(len(rgb_images), 4)
+    head = 24
     cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in rgb_images]
     rows = [cells[start : start + columns] for start in range(0, len(cells), columns)]
     heights = [head + GAP + max(cell.height for cell in row) for row in rows]
     legends = [_depth_bar(h - head - GAP, *ends) for h, ends in zip(heights, depth_ranges, strict=False)]
-    wide, top = GAP + columns * (cell_width + GAP), GAP
+    wide = GAP + columns * (cell_width + GAP)
+    top = GAP
     size = wide + max((legend.width for legend in legends), default=0), GAP + sum(heights)
-    sheet, named = Image.new("RGB", size, "white"), iter(titles)
+    sheet = Image.new("RGB", size, "white")
+    named = iter(titles)
     for number, (row, height) in enumerate(zip(rows, heights, strict=True)):
         names = list(itertools.islice(named, len(row)))
         for k, cell in enumerate(row):
@@ -340,7 +348,8 @@ def depth_frames(
     depths_m: Sequence[Map], near: float | None = None, far: float | None = None, unit: str | None = "m"
 ) -> Iterator[Image.Image]:
     """Draw one image per map ``(H, W)``, in the same colours, lazily."""
-    shapes, samples = set(), []
+    shapes = set()
+    samples = []
     for depth_m in depths_m:  # one pass: a map may be read from its file at every access
         every = max(1, math.ceil(len(depths_m) * depth_m.size / (4 * MAX_RANGE_PIXELS)))
         shapes.add(depth_m.shape)
@@ -379,7 +388,8 @@ def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image
     in ``check_video``, and without frames; ``OSError`` if the file cannot be written.
     """
     check_video(path, fps)
-    rest, kind = iter(frames), Path(path).suffix.lower()
+    rest = iter(frames)
+    kind = Path(path).suffix.lower()
     first = next(rest, None)
     if first is None:
         bad_value("frames", "at least one image", "none")

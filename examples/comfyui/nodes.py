@@ -212,7 +212,8 @@ class GeoDiffPointCloud:
         if format == "ply":
             write_ply(path, depth_m, image, K, keep)
         else:
-            size, rig = (image.shape[1], image.shape[0]), depth["rig"]
+            size = (image.shape[1], image.shape[0])
+            rig = depth["rig"]
             cameras = [(K, np.eye(4), size), (rig.K_right, rig.E, rig.size_right or size)]
             write_glb(path, make_cloud(depth_m, image, K, keep), cameras)
         shown = {"filename": path.name, "subfolder": subfolder, "type": "output"}

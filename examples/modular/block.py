@@ -379,7 +379,8 @@ class MetresStep(Block):
         depth_m = _at_image_size(processor, run.metric_prediction(block_state.latents), block_state)
         stock = MarigoldDepthOutput(depth_m, None, None)
         out = run.output(stock, block_state.guidance.findings)
-        block_state.guided_output, block_state.depth_m = out, out.prediction[0, ..., 0]
+        block_state.guided_output = out
+        block_state.depth_m = out.prediction[0, ..., 0]
         block_state.confidence = out.confidence[0, ..., 0]
         run.release()
 

@@ -73,8 +73,10 @@ class Features(nn.Module):
         super().__init__()
         convs = conv2d(3, 32, stride=2), conv2d(32, 32), conv2d(32, 32)
         self.firstconv = nn.Sequential(*(layer for conv in convs for layer in (conv, nn.ReLU())))
-        self.layer1, self.layer2 = residuals(32, 32, 3), residuals(32, 64, 16, stride=2)
-        self.layer3, self.layer4 = residuals(64, 128, 3), residuals(128, 128, 3, dilation=2)
+        self.layer1 = residuals(32, 32, 3)
+        self.layer2 = residuals(32, 64, 16, stride=2)
+        self.layer3 = residuals(64, 128, 3)
+        self.layer4 = residuals(128, 128, 3, dilation=2)
         for number, side in enumerate(self.POOLED, 1):
             branch = nn.Sequential(nn.AvgPool2d(side), conv2d(128, 32, size=1), nn.ReLU())
             setattr(self, f"branch{number}", branch)
@@ -95,7 +97,8 @@ class Hourglass(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         wide = 2 * channels
-        self.conv1, self.conv2 = nn.Sequential(conv3d(channels, wide, 2), nn.ReLU()), conv3d(wide, wide)
+        self.conv1 = nn.Sequential(conv3d(channels, wide, 2), nn.ReLU())
+        self.conv2 = conv3d(wide, wide)
         self.conv3 = nn.Sequential(conv3d(wide, wide, 2), nn.ReLU())
         self.conv4 = nn.Sequential(conv3d(wide, wide), nn.ReLU())
         self.conv5, self.conv6 = conv3d_up(wide, wide), conv3d_up(wide, channels)
@@ -163,7 +166,8 @@ class Predictor:
     """Callable from two images to disparity and confidence."""
 
     def __init__(self, network: PSMNet, device: str = "cpu") -> None:
-        self.network, self.device = network.eval().to(device), device
+        self.network = network.eval().to(device)
+        self.device = device
 
     @torch.inference_mode()
     def __call__(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

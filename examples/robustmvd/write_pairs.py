@@ -43,7 +43,8 @@ def write_pairs(out: Path, samples: Iterable[Mapping[str, Any]], name: str) -> i
     """
     count = 0
     for count, sample in enumerate(samples, 1):
-        folder, key = out / f"{name}-{count - 1:04d}", int(np.asarray(sample["keyview_idx"]))
+        folder = out / f"{name}-{count - 1:04d}"
+        key = int(np.asarray(sample["keyview_idx"]))
         for part in ("images", "cams", "depths"):
             (folder / part).mkdir(parents=True, exist_ok=True)
         sources = [i for i in range(len(sample["images"])) if i != key]

@@ -90,7 +90,10 @@ class LatentStore:
         world: int = 1,
         fresh: bool = False,
     ) -> None:
-        self.cache, self.vae, self.divisor, self.variants = Path(cache), vae, divisor, variants
+        self.cache = Path(cache)
+        self.vae = vae
+        self.divisor = divisor
+        self.variants = variants
         self.rank, self.world, self.fresh = rank, world, fresh
         self._folder = self.cache / f"latents-{_fingerprint(vae)}-{divisor}-disparity"
         self._items: list[tuple[torch.Tensor, torch.Tensor]] = []

@@ -12,7 +12,8 @@ from geodiff_plugin.priors import BUNDLED_FOLDER
 @pytest.fixture(scope="module")
 def louder(tmp_path_factory):
     """The shipped prior with twice the weights in its U-Net."""
-    pipeline, folder = open_pipeline(BUNDLED_FOLDER), tmp_path_factory.mktemp("louder") / "prior"
+    pipeline = open_pipeline(BUNDLED_FOLDER)
+    folder = tmp_path_factory.mktemp("louder") / "prior"
     for parameter in pipeline.unet.parameters():
         parameter.data *= 2
     return save_prior(pipeline, folder)

@@ -67,7 +67,8 @@ def test_shards_hold_the_same_scenes_for_the_same_seed(tmp_path, monkeypatch):
 
 
 def test_resizing_averages_images_and_picks_depth():
-    images, depth = torch.rand(1, 3, 8, 8), torch.arange(64.0).reshape(1, 1, 8, 8)
+    images = torch.rand(1, 3, 8, 8)
+    depth = torch.arange(64.0).reshape(1, 1, 8, 8)
     small, picked = resize_scenes(images, depth, 2)
     assert small.shape == (1, 3, 4, 4)
     assert small[0, 0, 0, 0] == pytest.approx(float(images[0, 0, :2, :2].mean()), abs=1e-6)

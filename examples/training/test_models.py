@@ -49,7 +49,8 @@ def test_learning_rate_warms_up_and_falls_to_a_hundredth():
 
 
 def test_loss_vanishes_for_the_true_velocity():
-    scheduler, generator = models.build_scheduler(), torch.Generator().manual_seed(0)
+    scheduler = models.build_scheduler()
+    generator = torch.Generator().manual_seed(0)
     image, depth, noise = (torch.randn(2, 4, 3, 3, generator=generator) for _ in range(3))
     timesteps = torch.tensor([999, 400])
     ground_truth = scheduler.get_velocity(depth, noise, timesteps)

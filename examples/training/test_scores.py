@@ -26,7 +26,8 @@ def test_plane_fits_a_plane_from_few_pixels(seed):
 
 
 def test_constant_is_the_mean_of_the_known_pixels():
-    depth, valid = _ramp(), np.zeros((12, 18), bool)
+    depth = _ramp()
+    valid = np.zeros((12, 18), bool)
     valid[2:5] = True
     assert best_constant(depth, valid)[0, 0] == pytest.approx(depth[2:5].mean())
 
@@ -55,7 +56,8 @@ def test_scenes_are_scored_after_alignment_without_sky_and_far_pixels():
 
 def test_contact_sheet_has_three_images_per_scene(tmp_path):
     depth = torch.from_numpy(_ramp()).float()[None, None].repeat(4, 1, 1, 1)
-    images, predictions = depth.repeat(1, 3, 1, 1) / 30.0, depth[:, 0].numpy().copy()
+    images = depth.repeat(1, 3, 1, 1) / 30.0
+    predictions = depth[:, 0].numpy().copy()
     depth[0, 0, 0, :] = float("inf")
     validate.contact_sheet(images, depth, predictions, tmp_path / "sheet.png", "depth", columns=3)
     with Image.open(tmp_path / "sheet.png") as sheet:

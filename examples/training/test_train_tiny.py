@@ -66,7 +66,8 @@ def test_perturbed_latents_stay_near():
 
 
 def test_the_student_has_the_teachers_latent(teacher):
-    tiny, x = build_tiny(teacher, width=8), torch.zeros(1, 3, 32, 48)
+    tiny = build_tiny(teacher, width=8)
+    x = torch.zeros(1, 3, 32, 48)
     codes = tiny.encode(x).latents
     assert codes.shape == teacher.encode(x).latent_dist.mode().shape
     assert tiny.decode(codes).sample.shape == x.shape

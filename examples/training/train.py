@@ -120,12 +120,15 @@ def _prepare_models(options: argparse.Namespace, accelerator: Accelerator):
     set_seed(options.seed)
     if options.init_from:
         start = open_pipeline(options.init_from)
-        vae, unet, text = start.vae, start.unet.train(), (start.text_encoder, start.tokenizer)
+        vae = start.vae
+        unet = start.unet.train()
+        text = (start.text_encoder, start.tokenizer)
         vae.requires_grad_(False)
         if accelerator.is_main_process:
             save_vae(vae, options.out / "vae.safetensors")
         return vae.to(accelerator.device), unet, text
-    seconds, batch = 60 * options.vae_minutes, options.vae_batch
+    seconds = 60 * options.vae_minutes
+    batch = options.vae_batch
     vae = train_vae(
         options.out, options.cache, accelerator, seconds, options.seed, batch, iterations=options.vae_steps
     )
@@ -150,7 +153,9 @@ def _train(options: argparse.Namespace, accelerator: Accelerator) -> Progress:
     network, prepared = accelerator.prepare(unet, optimiser)
     reporter = Reporter(options, assemble(vae, build_unet().to(device).eval(), text))
     step_of = _Step(network, _embed(text).to(device), options, accelerator, progress.step)
-    started, base, pools = time.monotonic(), progress.seconds, {}
+    started = time.monotonic()
+    base = progress.seconds
+    pools = {}
     bar = tqdm(total=1000, unit="permille", mininterval=10, disable=not accelerator.is_main_process)
     while True:
         progress.seconds = base + time.monotonic() - started
@@ -203,7 +208,10 @@ class _Step:
         accelerator: Accelerator,
         step: int,
     ) -> None:
-        self.network, self.text, self.batch, self.accelerator = network, text, options.batch, accelerator
+        self.network = network
+        self.text = text
+        self.batch = options.batch
+        self.accelerator = accelerator
         self.generator = torch.Generator().manual_seed(options.seed + 7919 * step + accelerator.process_index)
         self.scheduler = build_scheduler()
         self.scheduler.alphas_cumprod = self.scheduler.alphas_cumprod.to(accelerator.device)

@@ -111,7 +111,8 @@ def distillation_loss(
     Returns:
         Scalar.
     """
-    scale, shift = vae.config.scaling_factor, vae.config.get("shift_factor") or 0.0
+    scale = vae.config.scaling_factor
+    shift = vae.config.get("shift_factor") or 0.0
     with torch.no_grad():
         codes = scale * (vae.encode(maps).latent_dist.mode() - shift)
         latents = perturbed(codes, generator)
@@ -168,7 +169,9 @@ def train_tiny(
     generator = torch.Generator().manual_seed(seed)
     tiny = build_tiny(vae, width).to(vae.device).train()
     optimiser = torch.optim.AdamW(tiny.parameters(), lr=rate, betas=(0.9, 0.99), weight_decay=1e-4)
-    start, step, losses = time.monotonic(), 0, []
+    start = time.monotonic()
+    step = 0
+    losses = []
     while (done := step / steps if steps else (time.monotonic() - start) / seconds) < 1.0:
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(rate, done, step, warm_up=100)

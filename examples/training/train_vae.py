@@ -125,7 +125,8 @@ def train_vae(
     Returns:
         Frozen autoencoder with its ``scaling_factor`` set from the spread of depth latents.
     """
-    path, device = folder / "vae.safetensors", accelerator.device
+    path = folder / "vae.safetensors"
+    device = accelerator.device
     if path.exists():
         return load_vae(path, device)
     unfinished = folder / "vae-unfinished.safetensors"
@@ -137,7 +138,10 @@ def train_vae(
     crops = _Crops(cache)
     optimiser = torch.optim.AdamW(vae.parameters(), lr=rate, betas=(0.9, 0.99), weight_decay=1e-4)
     network, prepared = accelerator.prepare(_Loss(vae), optimiser)
-    start, step, done, saved = time.monotonic(), 0, 0.0, 0.0
+    start = time.monotonic()
+    step = 0
+    done = 0.0
+    saved = 0.0
     first = accelerator.is_main_process
     bar = tqdm(total=1000, desc="VAE", unit="permille", mininterval=10, disable=not first)
     while True:

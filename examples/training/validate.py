@@ -58,7 +58,8 @@ def score_scenes(
     Returns:
         AbsRel, delta1.
     """
-    predictions, scores = predict(pipeline, images_01, steps, resolution), []
+    predictions = predict(pipeline, images_01, steps, resolution)
+    scores = []
     for prediction, depth in zip(predictions, depth_m[:, 0].numpy(), strict=True):
         valid = depth < SCORED_M
         if valid.sum() > 100:

@@ -116,7 +116,8 @@ def check_pose(E: Any, name: str = "E", hint: str = POSE) -> np.ndarray:
         got = f"last row {E[3].tolist()}"
         bad_value(name, "rigid with last row (0, 0, 0, 1)", got, hint + " Is it transposed?")
     R = E[:3, :3]
-    deviation, determinant = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
+    deviation = np.abs(R @ R.T - np.eye(3)).max()
+    determinant = np.linalg.det(R)
     if deviation > 1e-2 or determinant < 0:
         expected = "rigid, with a rotation as upper left 3x3 (orthogonal within 1e-2, determinant +1)"
         got = f"determinant {determinant:.4f}, |R R^T - I| up to {deviation:.4f}"

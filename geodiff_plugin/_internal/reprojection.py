@@ -40,7 +40,8 @@ def depth_in_camera(depth: np.ndarray, camera: Camera, other: PosedCamera) -> np
         for px, z in _samples(inverse, rows, camera, other):
             inside = other.contains(px)
             column, row = (np.rint(at[inside]).astype(np.int64) for at in px.T)
-            cells, z_inside = torch.from_numpy(row * width + column), torch.from_numpy(z[inside])
+            cells = torch.from_numpy(row * width + column)
+            z_inside = torch.from_numpy(z[inside])
             keep_nearest(torch.from_numpy(nearest), cells, z_inside)
     seen = nearest.reshape(height, width)
     result = np.zeros((height, width), np.float32)
@@ -77,7 +78,8 @@ def _samples(
     y, x = np.nonzero(_is_surface(*corners_of_cells))
     if not len(y):
         return
-    px, corners = joined(x, y + rows.start), [part[y, x] for part in corners_of_cells]
+    px = joined(x, y + rows.start)
+    corners = [part[y, x] for part in corners_of_cells]
     count = _samples_per_side(px, corners, camera, other)
     for down in range(count):
         for right in range(count):
@@ -121,7 +123,8 @@ def _at_centres(
     for _ in range(STEPS + 1):
         off = _above_surface(rays * z[:, None] + other.E[:3, 3], inverse, camera)
         better = np.abs(off) < smallest
-        best, smallest = np.where(better, z, best), np.where(better, np.abs(off), smallest)
+        best = np.where(better, z, best)
+        smallest = np.where(better, np.abs(off), smallest)
         with np.errstate(divide="ignore", invalid="ignore"):
             step = off / rays[:, 2]
         z = np.where(np.isfinite(step) & (np.abs(z + step - first) <= MAX_STEP_FRACTION * first), z + step, z)

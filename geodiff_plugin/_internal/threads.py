@@ -47,13 +47,15 @@ class WithinCores:
         self._among = among
 
     def __enter__(self) -> None:
-        threads, cores = torch.get_num_threads(), max(1, available_cores() // self._among)
+        threads = torch.get_num_threads()
+        cores = max(1, available_cores() // self._among)
         if threads > cores:
             self._before, self._capped = threads, cores
             torch.set_num_threads(cores)
 
     def __exit__(self, *exc: object) -> None:
-        before, self._before = self._before, None
+        before = self._before
+        self._before = None
         if before is not None and torch.get_num_threads() == self._capped:
             torch.set_num_threads(before)
 
@@ -90,12 +92,14 @@ class BackgroundTask(Generic[T]):
         own_stream: bool = False,
         follows: bool = True,
     ) -> None:
-        self._stream, self._waiting = None, set[torch.cuda.Stream]()
+        self._stream = None
+        self._waiting = set[torch.cuda.Stream]()
         if not leaves_cpu_free(device):
             self._answer = Future[T]()
             self._answer.set_result(function())
             return
-        context, ready = contextvars.copy_context(), None
+        context = contextvars.copy_context()
+        ready = None
         if device.type == "cuda":
             self._stream = torch.cuda.current_stream(device)
             if own_stream:

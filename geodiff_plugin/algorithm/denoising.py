@@ -31,7 +31,8 @@ class NoiseLevel:
 
     def __post_init__(self) -> None:
         if self.prediction_type not in PREDICTION_TYPES:
-            expected, got = f"one of {PREDICTION_TYPES}", repr(self.prediction_type)
+            expected = f"one of {PREDICTION_TYPES}"
+            got = repr(self.prediction_type)
             bad_value("the scheduler's prediction_type", expected, got)
 
 

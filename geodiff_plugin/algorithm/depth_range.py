@@ -33,7 +33,8 @@ def span_of_points(evidence: Sequence[Evidence]) -> DepthRange:
 @torch.no_grad()
 def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Tensor]:
     """Find the g_s of least photometric loss at s_hat = t_hat = 0, and whether it is on the range's edge."""
-    config, zero = objective.config, x.new_zeros(x.shape[0])
+    config = objective.config
+    zero = x.new_zeros(x.shape[0])
     low, high = config.g_s_range
     candidates = torch.linspace(low, high, config.g_s_candidates, dtype=torch.float32, device=x.device)
 
@@ -61,7 +62,9 @@ def fit_depth_range(
     The ``current`` range, whose ``on_edge`` is ``None`` before the first search, is kept unless a better
     basin is found. Only ``valid (1, 1, h, w)`` pixels are compared.
     """
-    space, floored, reliable = metric.space, smooth_floor(x), evidence.reliable
+    space = metric.space
+    floored = smooth_floor(x)
+    reliable = evidence.reliable
     on_edge: Tensor | None
     if evidence.volume is None:
         assert evidence.points is not None  # without views there are points

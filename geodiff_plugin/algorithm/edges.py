@@ -82,7 +82,8 @@ class _Strip:
         centre = self._along((0, 0), 0)
         on_ramp = torch.zeros_like(centre, dtype=torch.bool)
         for way in DIRECTIONS:
-            ahead, behind = self._along(way, 1) - centre, centre - self._along(way, -1)
+            ahead = self._along(way, 1) - centre
+            behind = centre - self._along(way, -1)
             discontinuity = torch.minimum(ahead.abs(), behind.abs()) > MIN_STEP * centre
             ends = [
                 (self._along(way, k + 1) - self._along(way, k - 1)).abs()

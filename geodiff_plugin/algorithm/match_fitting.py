@@ -79,7 +79,8 @@ def _observations(depth_m: Tensor, target: Matches, left_01: Tensor, config: Gui
 @has_kernel("algorithm.kernels.match_fitting.residuals")
 def _residuals(log_depth: Tensor, target: Matches, match_sigma: float) -> tuple[Tensor, Tensor, Tensor]:
     """Compute residual, noise and weight of ``_Observations`` from log depth on the grid of the matches."""
-    matched, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
+    matched = target.inverse_depth.clamp_min(1e-9)
+    step = target.plane_step.view(-1, 1, 1, 1)
     noise = ((step / matched) ** 2 + match_sigma**2).sqrt()
     weight = target.confidence * (match_sigma / noise) ** 2
     residual = torch.where(weight > 0, matched.log() + log_depth, torch.zeros_like(matched))
@@ -185,7 +186,8 @@ def highest(values: Tensor, radius: int) -> Tensor:
     for axis in (-1, -2):
         covered = 1
         while covered < side:
-            step, last = min(covered, side - covered), values.shape[axis]
+            step = min(covered, side - covered)
+            last = values.shape[axis]
             shifted = (values.narrow(axis, first, last - step) for first in (0, step))
             values = torch.maximum(*shifted)
             covered += step

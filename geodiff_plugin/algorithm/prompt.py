@@ -34,6 +34,7 @@ def _prompt_of(evidence: Evidence, config: GuidanceConfig) -> Tensor | None:
     size = evidence.grid.size
     factor = min(1.0, PROMPT_LONG_EDGE / max(size))
     median = 1.0 / target.inverse_depth[target.confidence > 0].median()
-    flat, left = median.expand(1, 1, *size), evidence.grid.left.image_01[None]
+    flat = median.expand(1, 1, *size)
+    left = evidence.grid.left.image_01[None]
     fit = fit_depth(flat, target, left, prior_error(flat, target, left, config), config)
     return F.interpolate(fit.depth_m, scaled_size(size, factor, factor), mode="bilinear", antialias=True)

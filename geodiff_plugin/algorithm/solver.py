@@ -59,13 +59,15 @@ def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
 
     x = (x / root).flatten(2)
     residual = (system.rhs * root).flatten(2) - apply(x)
-    direction, along = residual.clone(), dot(residual, residual)
+    direction = residual.clone()
+    along = dot(residual, residual)
     for _ in range(steps):
         image = apply(direction)
         length = along / dot(direction, image).clamp_min(tiny)
         x.addcmul_(length, direction)
         residual.addcmul_(length, image, value=-1.0)
-        before, along = along, dot(residual, residual)
+        before = along
+        along = dot(residual, residual)
         direction = torch.addcmul(residual, along / before.clamp_min(tiny), direction)
     return x.view(system.rhs.shape) * root
 
@@ -84,10 +86,13 @@ def solve_robust(system: RobustSystem, rounds: int, steps: int, *, with_support:
     """
     sets = len(system.trusted) // len(system.data)
     observed, width = (part.repeat(sets, 1, 1, 1) for part in (system.data, system.width))
-    total, weights, solved = torch.zeros_like(observed), system.trusted, observed
+    total = torch.zeros_like(observed)
+    weights = system.trusted
+    solved = observed
     passes = list(zip(system.smoothness, system.tikhonov, strict=True))
     for k, (smoothness, tikhonov) in enumerate(passes):
-        data, start = observed - total, None
+        data = observed - total
+        start = None
         if with_support and k == len(passes) - 1:
             data = torch.cat([data, torch.ones_like(data)], 1)
         across, down = (
@@ -96,7 +101,8 @@ def solve_robust(system: RobustSystem, rounds: int, steps: int, *, with_support:
         damping = tikhonov.repeat(sets, 1, 1, 1)
         for _ in range(rounds):
             solved = solve_field(FieldSystem(weights + damping, weights * data, across, down), steps, start)
-            left_over, start = solved[:, :1] - data[:, :1], solved
+            left_over = solved[:, :1] - data[:, :1]
+            start = solved
             weights = system.trusted / (1.0 + (left_over / width) ** 2)
         total = total + solved[:, :1]
     return RobustField(total, weights, solved[:, 1:] if with_support else None)

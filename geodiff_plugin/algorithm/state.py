@@ -97,7 +97,8 @@ class Trajectory:
         lr_latents: float = 0.0,
     ) -> None:
         self.evidence = [evidence[image] for image in image_of_sample]  # one per sample
-        self.config, self.maps = config, replace(maps, valid=_valid_maps(maps.valid, self.evidence))
+        self.config = config
+        self.maps = replace(maps, valid=_valid_maps(maps.valid, self.evidence))
         self.metric = MetricMap(maps.space, config.positive)
         self.objective = Objective(chunk_views(self.evidence), self.metric, config)
         self.matches = Matches.stack([e.matches for e in self.evidence])
@@ -159,7 +160,8 @@ class Trajectory:
     @cached_property
     def _valid_evidence(self) -> list[Evidence]:
         """Evidence of every image, restricted to pixels with a prior depth."""
-        firsts, valid = [samples.start for samples in self._images], self.maps.valid
+        firsts = [samples.start for samples in self._images]
+        valid = self.maps.valid
         if valid is None:
             return [self.evidence[first] for first in firsts]
         return [self.evidence[first].within(valid[first]) for first in firsts]
@@ -168,7 +170,8 @@ class Trajectory:
         """Compute the rank correlation ``(B,)`` of the prior with matches or points; NaN for too few."""
         correlations = []
         for samples, evidence in zip(self._images, self._valid_evidence, strict=True):
-            target, of_image = evidence.matches or evidence.points, x[samples]
+            target = evidence.matches or evidence.points
+            of_image = x[samples]
             if target is None:
                 correlations.append(x.new_full((len(of_image),), torch.nan))
             else:
@@ -216,7 +219,8 @@ class Trajectory:
     def fitted(self, x: Tensor) -> Tensor:
         """Fit a relative map ``x (B, 1, h, w)`` to matches and points; returns ``x`` if there are none."""
         depth_m = self.objective.metric_depth(x, self.affine)
-        target, error = self._target(depth_m), local_error(self.error, self.maps.valid)
+        target = self._target(depth_m)
+        error = local_error(self.error, self.maps.valid)
         if target is None or error is None:
             return x
         fit = fit_depth(depth_m, target, self.objective.left_01, error, self.config)

@@ -138,7 +138,10 @@ def guided_step(
     state: Trajectory, estimate: Estimate, rounds: tuple[Round, ...], is_last: bool
 ) -> GuidedStep:
     """Run the rounds of one denoising step; the fitted map is the result if the step ``is_last``."""
-    z, anchor, x, is_current = estimate.latent, None, None, False
+    z = estimate.latent
+    anchor = None
+    x = None
+    is_current = False
     for k, (fits_matches, updates) in enumerate(rounds):
         is_current = fits_matches and not updates
         first_loss: Loss | None = None  # of the round, before its updates

@@ -92,8 +92,10 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
         TAP_NEIGHBOUR * (moments[..., :-2, :] + moments[..., 2:, :]) + TAP_CENTRE * moments[..., 1:-1, :]
     )
     mean_a, mean_b, square_a, square_b, product = moments.chunk(5, 1)
-    means, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
-    covariance, variances = product - means, square_a + square_b - squares
+    means = mean_a * mean_b
+    squares = mean_a * mean_a + mean_b * mean_b
+    covariance = product - means
+    variances = square_a + square_b - squares
     return (2.0 * means + C1) * (2.0 * covariance + C2) / ((squares + C1) * (variances + C2) + 1e-12)
 
 
@@ -136,10 +138,12 @@ def photometric(left_01: Tensor, warped_01: Tensor, visible: Tensor, config: Gui
     """
     views = warped_01.shape[1]
     left = left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), one entry per view
-    warped, mask = warped_01.flatten(0, 1), visible.flatten(0, 1).to(left.dtype)
+    warped = warped_01.flatten(0, 1)
+    mask = visible.flatten(0, 1).to(left.dtype)
     if config.exposure:
         warped = match_exposure(warped, left, mask)
-    total, levels = left.new_zeros(()), 0
+    total = left.new_zeros(())
+    levels = 0
     for level in range(config.pyramid_levels):
         if level:
             if min(left.shape[-2:]) < 2 * MIN_SIDE:
@@ -343,7 +347,8 @@ class Objective:
         visible_fraction = in_view.any(1).float().flatten(1).mean(1)
         if (left := self._valid[0]) is not None:
             visible_fraction = visible_fraction / left.float().flatten(1).mean(1).clamp_min(1e-6)
-        total, values = torch.zeros_like(visible_fraction), {}
+        total = torch.zeros_like(visible_fraction)
+        values = {}
         for name, weight in active.items():
             value = TERMS[name].function(compared)
             if TERMS[name].needs == "views":
@@ -354,7 +359,8 @@ class Objective:
 
     def occluded(self, x: Tensor, affine: AffineState) -> Tensor:
         """Return ``(B, V, 1, H, W)`` bool: pixels that the estimate itself occludes in each right view."""
-        depth_m, each = self.metric_depth(x, affine), zip(self.rights_01, self._rays, strict=True)
+        depth_m = self.metric_depth(x, affine)
+        each = zip(self.rights_01, self._rays, strict=True)
         return torch.stack([occluded_in_right(depth_m, rays, image_size(image)) for image, rays in each], 1)
 
     def _warp(self, depth_m: Tensor) -> tuple[Tensor, Tensor]:

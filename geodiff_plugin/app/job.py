@@ -363,7 +363,8 @@ def run_job(
             raise Stopped
         report(fraction, name)
 
-    options, log = request.options, JobLog()
+    options = request.options
+    log = JobLog()
     with collected_warnings(silent):  # warnings are in the log
         stage(0.0, "Reading images and cameras")
         # Uploads are stored in temporary folders, so reports name the files without their folders.

@@ -241,7 +241,8 @@ class _Handlers:
 
         with self.queue.acquire(run, wait):
             job = self.compute(session, run, request, progress)
-            secret, result = session.secret, self.sessions.result(session)
+            secret = session.secret
+            result = self.sessions.result(session)
             if result is None:
                 return
             for html in drawn(result, session.tab):
@@ -255,7 +256,8 @@ class _Handlers:
 
         A later run of the same visitor ends this one without a message.
         """
-        run, request = session.begin(), None
+        run = session.begin()
+        request = None
         yield values | self.keep(session, "") | self.controls(templates.running(self.form.name(filled)))
         try:
             request = self.form.request(filled)

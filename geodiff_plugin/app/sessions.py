@@ -181,7 +181,8 @@ class Sessions:
         with session.lock:
             if session.run is not run or run.stop.is_set():
                 raise Stopped
-            before, session.secret = session.secret, self.store.add(Result(shown, pixels))
+            before = session.secret
+            session.secret = self.store.add(Result(shown, pixels))
         self.store.drop(before)
 
     def leave(self, name: str | None) -> None:

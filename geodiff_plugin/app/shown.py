@@ -144,7 +144,8 @@ def _cameras(run: PairRun) -> str:
     (fx, _, cx), (_, fy, cy), _ = np.asarray(run.output.K)[0].astype(np.float64)
     x, y, z = baseline = run.inputs.guidance.rigs[0].E[:3, 3]
     offsets = {"right": x, "left": -x, "below": y, "above": -y, "in front": z, "behind": -z}
-    side, distance = max(offsets, key=lambda side: offsets[side]), np.linalg.norm(baseline)
+    side = max(offsets, key=lambda side: offsets[side])
+    distance = np.linalg.norm(baseline)
     lens = f"fx {fx:.1f}, fy {fy:.1f}, cx {cx:.1f}, cy {cy:.1f} px"
     return f"Left camera: {lens}. Right camera: {distance:.3g} m away ({side})."
 

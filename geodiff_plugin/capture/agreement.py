@@ -68,7 +68,8 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
     """
     weight = OWN_WEIGHT * (MIN_WEIGHT + frame.confidence)
     known = frame.depth > 0  # pixels that are not valid have no depth
-    total, above = weight.copy(), weight / np.where(known, frame.depth, 1.0)
+    total = weight.copy()
+    above = weight / np.where(known, frame.depth, 1.0)
     confirmed, observers = (np.zeros(frame.depth.shape, np.uint8) for _ in range(2))
     missing = 1.0 - frame.confidence
     for other in others:
@@ -79,7 +80,8 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
         total += more
         above += more / np.where(found.agrees, found.depth, 1.0)
         missing = missing * np.where(found.agrees, 1.0 - CONFIDENCE_GAIN * found.confidence, 1.0)
-    inverse, confidence = above / total, 1.0 - missing
+    inverse = above / total
+    confidence = 1.0 - missing
     unconfirmed = (
         known & (confirmed == 0) & (frame.confidence < (MIN_STATIC_CONFIDENCE if moving else np.inf))
     )
@@ -212,7 +214,8 @@ def _vote(seen_by: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) ->
         weight = (weights * same).sum(0)
         mean = (weights * same * inverse).sum(0) / np.maximum(weight, 1e-9)
         confidence = 1.0 - np.where(same, 1.0 - CONFIDENCE_GAIN * confidences, 1.0).prod(0)
-        better, candidate_vote = weight > best.weight, _Vote(same.sum(0), weight, mean, confidence)
+        better = weight > best.weight
+        candidate_vote = _Vote(same.sum(0), weight, mean, confidence)
         best = _Vote(*(np.where(better, new, old) for new, old in zip(candidate_vote, best, strict=True)))
     return best._replace(supporters=best.supporters.astype(np.uint8))
 
@@ -253,7 +256,8 @@ def _motion(before: _Image, after: _Image) -> np.ndarray | None:
         return None
     px, seen = before.features[0][pairs[:, 0], :2], after.features[0][pairs[:, 1], :2]
     column, row = np.rint(px).astype(int).clip(0, np.array(before.depth.shape[::-1]) - 1).T
-    points, K = before.camera.rays(px) * before.depth[row, column, None], after.camera.K
+    points = before.camera.rays(px) * before.depth[row, column, None]
+    K = after.camera.K
     fits, rotation, translation, inliers = cv2.solvePnPRansac(
         points, seen, K, None, reprojectionError=INLIER_PX
     )

@@ -65,7 +65,10 @@ class Capture:
     def __init__(
         self, frames: Sequence[CaptureFrame], kind: str, unit: str | None, findings: Sequence[Finding]
     ) -> None:
-        self.frames, self.kind, self.unit, self.findings = list(frames), kind, unit, list(findings)
+        self.frames = list(frames)
+        self.kind = kind
+        self.unit = unit
+        self.findings = list(findings)
         self.names = [frame.name for frame in frames]
         if len(set(self.names)) < len(self.names):  # duplicate names would be ambiguous
             bad_value("the frames", "uniquely named", ", ".join(self.names))
@@ -116,7 +119,8 @@ class Capture:
         wanted = ":" if wanted is None else wanted
         if ":" not in wanted:
             return [self.frame(name.strip()).name for name in wanted.split(",") if name.strip()]
-        match, every = re.fullmatch(r"(\d*):(\d*)(?::0*([1-9]\d*))?", wanted), (0, len(self) - 1, 1)
+        match = re.fullmatch(r"(\d*):(\d*)(?::0*([1-9]\d*))?", wanted)
+        every = (0, len(self) - 1, 1)
         numbers = match and [int(n or default) for n, default in zip(match.groups(), every, strict=True)]
         if not numbers or not numbers[0] <= numbers[1] < len(self):
             expected = f"NAME,NAME or FIRST:LAST:STEP, increasing numbers from 0 to {len(self) - 1}"
@@ -143,7 +147,8 @@ class Capture:
         if self.solved is None or poses not in (None, self._way):
             self._way = poses or "refined"
             self.solved = None  # its overlays are found again
-            chosen, samples = sampled_frames(len(self)), list[np.ndarray]()
+            chosen = sampled_frames(len(self))
+            samples = list[np.ndarray]()
             solved = solve_capture(
                 self._greys({self.names[i] for i in chosen}, samples),
                 GivenFrames(self.names, [frame.camera for frame in self.frames], self.poses),
@@ -173,7 +178,9 @@ class Capture:
     def rescale(self, factor: float) -> None:
         """Multiply all lengths by a factor > 0 that converts them to metres."""
         check_number(factor, "metres per unit", 1e-12, 1e12)
-        frames, solved, longer = [], self.solved, np.ones((4, 4))
+        frames = []
+        solved = self.solved
+        longer = np.ones((4, 4))
         longer[:3, 3] = factor
         for frame in self.frames:
             points = None if frame.points is None else frame.points * factor
@@ -186,7 +193,8 @@ class Capture:
 
     def camera(self, name: str) -> PosedCamera:
         """Return the solved camera of a frame's ``image``, posed in the capture's world frame."""
-        frame, solved = self.frame(name), self.solve()
+        frame = self.frame(name)
+        solved = self.solve()
         number = self.names.index(name)
         return PosedCamera(solved.K[number], frame.size, E=solved.E[number])
 
@@ -226,7 +234,8 @@ class Capture:
     def neighbours(self, name: str, count: int = NEIGHBOURS) -> list[str]:
         """Choose at most ``count`` frames as right views of a frame, best first."""
         check_number(count, "neighbours", 1, 32, integer=True)
-        solved, number = self.solve(), self.names.index(self.frame(name).name)
+        solved = self.solve()
+        number = self.names.index(self.frame(name).name)
         return [self.names[i] for i in choose_neighbours(solved, number, count)]
 
     def guidance(
@@ -243,7 +252,8 @@ class Capture:
         names = self.neighbours(name, neighbours) if isinstance(neighbours, int) else list(neighbours)
         if not names:
             bad_value(f"frame {name}", "connected to other frames by shared points", "no shared points")
-        i, rights = self.names.index(name), [self.names.index(other) for other in names]
+        i = self.names.index(name)
+        rights = [self.names.index(other) for other in names]
         read = [self._masked(self.names[j]) for j in rights]
         views: list[tuple[Any, ...]] = [(None, solved.K[i], np.eye(4))]
         views += [(image, solved.K[j], solved.pose(i, j)) for j, (image, _) in zip(rights, read, strict=True)]
@@ -299,7 +309,8 @@ class Capture:
         if solved.status not in ADJUSTED or not solved.connected[number]:
             return None
         every = np.concatenate([points for _, points in solved.seen])
-        seen, frames = solved.seen[number][1], np.bincount(every, minlength=len(solved.points))
+        seen = solved.seen[number][1]
+        frames = np.bincount(every, minlength=len(solved.points))
         xyz = _in_camera(solved.points[seen[frames[seen] >= MIN_FRAMES]], solved.E[number])
         ahead = xyz[xyz[:, 2] > 0]
         return ahead if len(ahead) else None
@@ -359,7 +370,8 @@ def choose_neighbours(
     """
     values = _values(solved, frame)
     chosen: list[int] = []
-    first, left = 0.0, np.ones(values.shape[1])
+    first = 0.0
+    left = np.ones(values.shape[1])
     out = (values > 0).sum(1) < MIN_SHARED
     out |= [among is not None and i not in among for i in range(len(out))]
     while len(chosen) < count:

@@ -85,8 +85,10 @@ def _loaded(folder: Path, maps: Mapping[str, str]) -> dict[str, np.ndarray]:
 
 def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
     """Check finished frames against overlapping ones, write the result, return pixel fractions."""
-    solved, number = capture.solve(), {name: i for i, name in enumerate(capture.names)}
-    available, fractions = {number[name] for name in names}, {}
+    solved = capture.solve()
+    number = {name: i for i, name in enumerate(capture.names)}
+    available = {number[name] for name in names}
+    fractions = {}
     load = lru_cache(maxsize=2 * OTHERS)(partial(_frame, capture, out, ALONE))
     for name in names:
         others = [load(capture.names[i]) for i in choose_neighbours(solved, number[name], OTHERS, available)]
@@ -196,7 +198,8 @@ def write_results(
         return replace(frame, observers=np.ones_like(frame.observers)) if name in unsure else frame
 
     cloud, normals = fuse(names, load, capture.image)
-    parts, count = (cloud.points_m, normals, cloud.colours), len(cloud.points_m)
+    parts = (cloud.points_m, normals, cloud.colours)
+    count = len(cloud.points_m)
     write_vertices(out / "cloud.ply", "world frame", capture.unit, count, VERTEX, [parts])
     cameras = map(capture.camera, names)
     drawn = [(camera.K, camera.E, camera.size) for camera in cameras]
@@ -221,8 +224,10 @@ def _confident(frame: DepthFrame) -> SplatFrame:
 def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[str]) -> None:
     """Draw evenly sampled frames and their depth with a common colour range; mark untrusted frames."""
     shown = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, ON_SHEET).astype(int))]
-    depths, unit = [np.load(out / name / "depth.npy") for name in shown], capture.unit
-    alike, figure = len({depth.shape for depth in depths}) == 1, partial(plotting.depth_figure, unit=unit)
+    depths = [np.load(out / name / "depth.npy") for name in shown]
+    unit = capture.unit
+    alike = len({depth.shape for depth in depths}) == 1
+    figure = partial(plotting.depth_figure, unit=unit)
     figures = plotting.depth_frames(depths, unit=unit) if alike else map(figure, depths)
     cells: list[Any] = []
     for name, drawn in zip(shown, figures, strict=True):
@@ -239,7 +244,8 @@ def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
 
     def frames() -> Iterator[Image.Image]:
         for name, depth in zip(names, maps, strict=True):
-            photo, drawn = plotting.as_rgb_image(capture.image(name)), plotting.colour_depth(depth, near, far)
+            photo = plotting.as_rgb_image(capture.image(name))
+            drawn = plotting.colour_depth(depth, near, far)
             yield ImageOps.pad(Image.fromarray(np.hstack([np.asarray(photo), drawn])), VIDEO_SIZE)
 
     try:
@@ -280,7 +286,8 @@ def fuse(
     ``load`` returns the agreed frame of a name, ``image`` its ``(H, W, 3)`` in [0, 1].
     """
     cell = CELL_FRACTION * _median_depth(map(load, names))
-    every_point, parts = np.zeros((0, 9)), list[np.ndarray]()
+    every_point = np.zeros((0, 9))
+    parts = list[np.ndarray]()
     for number, name in enumerate(names, 1):
         frame = load(name)
         mask = kept(frame)
@@ -288,7 +295,8 @@ def fuse(
         rows = np.hstack([frame.world()[mask], normals, image(name)[mask] * 255])
         parts.append(_thinned(rows[:: max(1, len(rows) // MAX_POINTS)], cell))
         if number % MERGED_AFTER == 0 or number == len(names):
-            every_point, parts = _thinned(np.concatenate([every_point, *parts]), cell), []
+            every_point = _thinned(np.concatenate([every_point, *parts]), cell)
+            parts = []
     normals = every_point[:, 3:6]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return Cloud(every_point[:, :3], np.rint(every_point[:, 6:]).astype(np.uint8)), normals
@@ -326,13 +334,16 @@ def write_workspace(
     """
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    views, maps, colours = [], folder / "stereo", np.zeros(points.shape, np.uint8)
+    views = []
+    maps = folder / "stereo"
+    colours = np.zeros(points.shape, np.uint8)
     for frame, (px, rows) in zip(frames, seen, strict=True):
         rgb = plotting.as_rgb_image(image(frame.name))
         save_png(rgb, folder / "images" / f"{frame.name}.png")
         u, v = np.rint(px).astype(int).T.clip(0, np.array(rgb.size)[:, None] - 1)
         colours[rows] = np.asarray(rgb)[v, u]
-        depth, file = np.where(kept(frame), frame.depth, 0)[..., None], f"{frame.name}.png.geometric.bin"
+        depth = np.where(kept(frame), frame.depth, 0)[..., None]
+        file = f"{frame.name}.png.geometric.bin"
         write_map(maps / "depth_maps" / file, depth)
         write_map(maps / "normal_maps" / file, normals_of(frame.depth, frame.camera))
         views.append((f"{frame.name}.png", frame.camera.K, frame.camera.E, rgb.size))
@@ -359,7 +370,8 @@ def write_mesh(
     """Write a mesh of all frames by TSDF fusion (extra ``mesh``)."""
     import open3d
 
-    core, tensors = open3d.core, open3d.t.geometry
+    core = open3d.core
+    tensors = open3d.t.geometry
     voxel = MESH_FRACTION * _median_depth(map(load, names))
     kinds = ("tsdf", "weight", "color"), (core.float32,) * 3, ((1,), (1,), (3,))
     volume = tensors.VoxelBlockGrid(*kinds, voxel, BLOCK, BLOCKS)
@@ -367,7 +379,8 @@ def write_mesh(
         depth = np.where(kept(frame), frame.depth, 0).astype(np.float32)
         colour = np.ascontiguousarray(image(frame.name), np.float32)
         maps = [tensors.Image(core.Tensor(values)) for values in (depth[..., None], colour)]
-        K, T = core.Tensor(frame.camera.K.astype(np.float64)), core.Tensor(np.linalg.inv(frame.camera.E))
+        K = core.Tensor(frame.camera.K.astype(np.float64))
+        T = core.Tensor(np.linalg.inv(frame.camera.E))
         radius = 1.0, float(depth.max()) * 1.01 + voxel
         blocks = volume.compute_unique_block_coordinates(maps[0], K, T, *radius)
         volume.integrate(blocks, *maps, K, K, T, *radius)

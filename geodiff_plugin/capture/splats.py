@@ -100,7 +100,8 @@ def write_splats(
 
 def _write_points(path: Path, capture: Capture, cloud: Cloud) -> None:
     """Write a cloud in metres in the capture's original length unit."""
-    points, names = cloud.points_m / capture.metres_per_unit, (*"xyz", "red", "green", "blue")
+    points = cloud.points_m / capture.metres_per_unit
+    names = (*"xyz", "red", "green", "blue")
     write_vertices(path, "frame of transforms.json", None, len(points), names, [(points, cloud.colours)])
 
 
@@ -108,7 +109,8 @@ def _write_frame(
     folder: Path, capture: Capture, found: SplatFrame, original: TransformsFile | None
 ) -> dict[str, Any]:
     """Write the files of a frame, return its entries; ``original_path`` is its path in the original."""
-    frame, depth = capture.frame(found.depth.name), found.depth
+    frame = capture.frame(found.depth.name)
+    depth = found.depth
     entries = {} if original is None else dict(original.frames.get(frame.image, {}))
     named = entries.get("file_path", frame.name)
     entries = {key: value for key, value in entries.items() if key not in (*REPLACED_OF_FRAME, *NERF_CAMERA)}

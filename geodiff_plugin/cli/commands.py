@@ -169,7 +169,8 @@ class _Typed(click.ParamType[Any]):
     """Parser for the typed value of a setting. Bad values raise ``InputError``, as in all checks."""
 
     def __init__(self, option: Setting) -> None:
-        self.option, self.name = option, METAVARS.get(option.kind, "TEXT")
+        self.option = option
+        self.name = METAVARS.get(option.kind, "TEXT")
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Parse a typed value; a default is already parsed."""

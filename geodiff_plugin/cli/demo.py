@@ -92,7 +92,10 @@ def _write_comparison(
 
 def run_real_demo(pairs: Sequence[DepthOptions], out: Path) -> None:
     """Write the output of ``geodiff depth`` for every pair to ``out/NAME``, and one ``comparison.png``."""
-    first, cells, titles, ranges = pairs[0], list[np.ndarray](), list[str](), list[tuple[float, float]]()
+    first = pairs[0]
+    cells = list[np.ndarray]()
+    titles = list[str]()
+    ranges = list[tuple[float, float]]()
     notify = silent if first.quiet else say
     with collected_warnings():
         pipe = prior_of_options(first, pick_device(first.device), None if first.quiet else say)
@@ -112,14 +115,16 @@ def run_real_demo(pairs: Sequence[DepthOptions], out: Path) -> None:
 
 def run_bench(options: Any) -> None:
     """Print the seconds of a plain and a guided call, the throughput, and the stages of a command."""
-    place, pair = pick_device(options.device), read_demo_pair()
+    place = pick_device(options.device)
+    pair = read_demo_pair()
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
     pipe = load_guided_prior(options.prior, place, options.space, options.dtype)
     enable_geometry_guidance(pipe, cuda_graphs=options.cuda_graphs, kernels=not options.no_triton)
     guidance = GeometryGuidance(pair.right, (pair.rig.K_left, pair.rig.K_right), pair.rig.E)
     count, _ = count_guided_steps(pipe, guidance, options.steps)
     generator = torch.Generator("cpu").manual_seed(options.seed)
-    table, fastest = new_table(("", "seconds", "ratio")), list[float]()
+    table = new_table(("", "seconds", "ratio"))
+    fastest = list[float]()
     for name, given in (("plain", None), ("guided", guidance)):
         call = partial(pipe, pair.left, guidance=given, num_inference_steps=count, generator=generator)
         fastest.append(min(timed(call, place) for _ in range(CALLS)))

@@ -33,7 +33,8 @@ CLOSING_KEYS = (ord("q"), 27)
 
 def run_live(options: LiveOptions) -> None:
     """Process frames until the source ends, Ctrl-C is pressed or the window is closed; print the totals."""
-    meter, printed = LiveMeter(), -math.inf
+    meter = LiveMeter()
+    printed = -math.inf
     with collected_warnings(), ExitStack() as stack:
         window = stack.enter_context(_Window("geodiff live")) if options.window else None
         notify = silent if options.quiet else say

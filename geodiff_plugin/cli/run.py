@@ -54,7 +54,8 @@ def run_depth(options: DepthOptions, folder: OutFolder, started: float) -> None:
     ``folder`` is already held. ``started`` is the ``perf_counter`` time at which the import of this module
     started.
     """
-    log, progress = JobLog(seconds={"start": time.perf_counter() - started}), not options.quiet
+    log = JobLog(seconds={"start": time.perf_counter() - started})
+    progress = not options.quiet
     with collected_warnings():
         result = depth_pair(options, folder=folder, log=log, notify=_notify(options), progress=progress)
     report = result.report

@@ -59,7 +59,8 @@ def _ratio(out: Path, by_change: ByChange, change: Change) -> tuple[float, ...] 
 
 def ratio_table(title: str, pairs: Mapping[str, ByChange], out: Path) -> Table:
     """Return the ratios and errors of each pair, and their means over rectified and over posed pairs."""
-    rows, numbers = [], dict[str, list[float | None]]()
+    rows = []
+    numbers = dict[str, list[float | None]]()
     for label, by_change in pairs.items():
         ratios = [_ratio(out, by_change, change) for change in CHANGES.values()]
         records = [by_change.get(change) for change in (GIVEN, *CHANGES.values())]

@@ -80,7 +80,10 @@ def temporal_error(frames: Sequence[DepthFrame]) -> float:
 
 def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
     """Measure every row and number of neighbours, and write the page; errors as in ``run_experiment``."""
-    priors, settings, cells, titles = PriorCache(), options.settings, list[Item](), dict[str, str]()
+    priors = PriorCache()
+    settings = options.settings
+    cells = list[Item]()
+    titles = dict[str, str]()
     for data in options.data:
         captures = {poses: Capture.open(data) for poses in ("given", "refined")}
         names = captures["given"].choose(options.frames)
@@ -126,7 +129,8 @@ def _measure_frames(
     for name in names:
         with torch.no_grad():
             out = capture.depth(pipe, name, count, seed=options.seed, parameters={"pose": row.pose}, **call)
-        camera, depth = capture.camera(name), np.asarray(out.prediction)[0, ..., 0]
+        camera = capture.camera(name)
+        depth = np.asarray(out.prediction)[0, ..., 0]
         confidence = np.ones_like(depth) if out.confidence is None else np.asarray(out.confidence)[0, ..., 0]
         ground_truth, valid = capture.measured_depth(name)
         frames.append(DepthFrame(name, depth, confidence, camera))
@@ -150,7 +154,8 @@ def _thin(frames: Sequence[DepthFrame], known: Sequence[np.ndarray]) -> np.ndarr
 
 def _of_points(capture: Capture, names: Sequence[str]) -> Record:
     """Return the solve's sparse points at their pixels."""
-    solved, scores = capture.solve(), []
+    solved = capture.solve()
+    scores = []
     for name in names:
         i = capture.names.index(name)
         ground_truth, known = capture.measured_depth(name)
@@ -164,7 +169,8 @@ def _of_points(capture: Capture, names: Sequence[str]) -> Record:
 
 
 def _scores(depth: np.ndarray, ground_truth: np.ndarray, known: np.ndarray) -> dict[str, float]:
-    scores, ratio = evaluate_depth(depth, ground_truth, known), depth[known] / ground_truth[known]
+    scores = evaluate_depth(depth, ground_truth, known)
+    ratio = depth[known] / ground_truth[known]
     scale = float(np.median(ratio))
     scaled = {"scaled": float(np.mean(np.abs(ratio / scale - 1))), "scale": scale}
     within = {"delta_103": float((np.maximum(ratio, 1 / ratio) < 1.03).mean()), "delta_125": scores["delta1"]}

@@ -130,7 +130,8 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
 
     With several processes (``RANK``, ``WORLD_SIZE``) each takes every N-th sample.
     """
-    shard, every = Shard.of(None), list({cell.key: cell for cell in cells}.values())
+    shard = Shard.of(None)
+    every = list({cell.key: cell for cell in cells}.values())
     samples = dict.fromkeys(_sample_of(cell) for cell in every)
     mine = set(shard.part(list(samples)))
     with Journal(options.out / journal, shard) as records, warnings.catch_warnings():
@@ -206,7 +207,8 @@ def _positive(depth_m: np.ndarray | None) -> np.ndarray:
 def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Scores]:
     """``DISPARITY_METRICS`` of a rectified sample, for ``all`` pixels with ground truth and by region."""
     (pred_px, true_px), valid = _disparities(sample, depth_m), sample.valid
-    masks, hidden = {"all": valid}, sample.occluded
+    masks = {"all": valid}
+    hidden = sample.occluded
     if hidden is None and valid.mean() > DENSE:
         hidden = metrics.occluded_by_ground_truth(true_px, valid)
     if hidden is not None:
@@ -307,7 +309,8 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
     record: dict[str, Any] = {"all_pixels": both(None)}
     record["capped"] = record["all_pixels"] if cap_m is None else both(cap_m)
     kept = metrics.counted(ground_truth, valid, cap_m)
-    shown_m, errors = in_metres(prediction, ground_truth, kept), {}
+    shown_m = in_metres(prediction, ground_truth, kept)
+    errors = {}
     for name, mask in regions(sample).items():
         if (mask & kept).any():
             errors[name] = metrics.evaluate_depth(shown_m, ground_truth, mask & kept, cap_m)["abs_rel"]
@@ -329,7 +332,8 @@ def _measure(
     path: Path | None,
 ) -> Record:
     """Run one method on one sample and score it; save its depth map to ``path``, if given."""
-    sample, process = read(ref), {"process": Shard.of(None).index}
+    sample = read(ref)
+    process = {"process": Shard.of(None).index}
     try:
         prediction, cost = _timed_run(method, sample, settings, priors)
     except NotApplicable as reason:
@@ -381,7 +385,9 @@ def method_cells(
 ) -> list[Item]:
     """Return a cell per method and sample in ``RECORDS_NAME``; with ``save_depth`` also saves maps."""
     # One sample, read once, is used for all its methods.
-    shard, priors, read = Shard.of(None), PriorCache(), lru_cache(maxsize=1)(load)
+    shard = Shard.of(None)
+    priors = PriorCache()
+    read = lru_cache(maxsize=1)(load)
     several = not shard.whole
     if several and settings.device == "cuda":
         settings = replace(settings, device=f"cuda:{shard.local % torch.cuda.device_count()}")
@@ -394,6 +400,7 @@ def method_cells(
         path = map_path(out, method.name, ref.dataset, ref.name) if save_depth else None
         work = partial(_measure, ref, read, method, chosen, priors, path=path)
         head = {"dataset": ref.dataset, "sample": ref.name, "method": method.name}
-        key, name = cell_key(ref, method.base_name, configuration, prior), f"{ref.label}, {method.name}"
+        key = cell_key(ref, method.base_name, configuration, prior)
+        name = f"{ref.label}, {method.name}"
         cells.append(Item(key, work, name=name, words=(method.name,), head=head))
     return cells

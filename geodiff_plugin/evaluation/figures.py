@@ -109,7 +109,8 @@ def _curves(
     drawn: dict[str, list[float | None]] = {}
     for index, (name, of_method) in enumerate(groups.items()):
         done = [[value_of(record) for record in group if record["status"] == "ok"] for group in of_method]
-        means, colour = list(map(mean_with_interval, done)), COLOURS[index % len(COLOURS)]
+        means = list(map(mean_with_interval, done))
+        colour = COLOURS[index % len(COLOURS)]
         marks = {"color": colour, "marker": MARKERS[index % len(MARKERS)], "markersize": 4}
         axes.plot(x, [mean.value for mean in means], label=find_method(name).title, **marks)
         if all(mean.low is not None for mean in means):
@@ -121,7 +122,8 @@ def _curves(
 
 def draw_guidance_steps(options: FigureOptions) -> Drawing:
     """Plot error and seconds against updates per denoising step, for both presets."""
-    updates, refs = sorted(set(options.updates)), select(options)
+    updates = sorted(set(options.updates))
+    refs = select(options)
     methods = {preset: [f"{preset}:guidance_steps={n}" for n in updates] for preset in PRESETS}
     records = grouped(_records(options, refs, list(chain(*methods.values()))), "method")
     groups = {preset: [records.get(name, []) for name in names] for preset, names in methods.items()}
@@ -221,7 +223,8 @@ MAX_ERROR_SHOWN = 0.5
 
 def orbit(centre_m: float) -> np.ndarray:
     """Return ``T_view_from_left`` ``(4, 4)`` of a camera orbiting left and up around a point on the axis."""
-    T, centre = np.eye(4), np.array([0.0, 0.0, centre_m])
+    T = np.eye(4)
+    centre = np.array([0.0, 0.0, centre_m])
     T[:3, :3] = Rotation.from_euler("yx", [-25.0, 12.0], degrees=True).as_matrix()
     T[:3, 3] = centre - T[:3, :3] @ centre
     return T
@@ -291,8 +294,11 @@ def _rows(
 
 def draw_side_by_side(shown: Sequence[str], options: FigureOptions) -> Drawing:
     """Draw depth and errors of every method per sample; ``shown`` are methods without an option."""
-    methods, priors = options.methods or shown, PriorCache()
-    cells, titles, numbers = list[np.ndarray](), list[str](), dict[str, Any]()
+    methods = options.methods or shown
+    priors = PriorCache()
+    cells = list[np.ndarray]()
+    titles = list[str]()
+    numbers = dict[str, Any]()
     for sample in [load(ref).check_ground_truth() for ref in select(options)]:
         answers = [_answer(sample, name, options.settings, priors) for name in methods]
         images, headings = _rows(sample, answers, options.clouds)
@@ -303,7 +309,8 @@ def draw_side_by_side(shown: Sequence[str], options: FigureOptions) -> Drawing:
 
 def draw_risk_coverage(options: FigureOptions) -> Drawing:
     """Plot AbsRel of the most confident pixels against their fraction, and the best possible order."""
-    refs, methods = select(options), list(options.methods or ("guided", "fast"))
+    refs = select(options)
+    methods = list(options.methods or ("guided", "fast"))
     curves = mean_risk(_records(options, refs, methods))
     figure = _new_figure(5.2, 3.4)
     figure.suptitle(count_of_pairs(len(refs)), fontsize=9)

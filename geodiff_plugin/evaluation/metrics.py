@@ -86,7 +86,8 @@ def evaluate_depth(
     scores = {"coverage": float(filled.mean()), "pixels": float(kept.sum())}
     if not filled.any():
         return dict.fromkeys(DEPTH_METRICS, float("nan")) | scores
-    pred, ground_truth = np.clip(pred[filled], FLOOR_M, cap_m), ground_truth[filled]
+    pred = np.clip(pred[filled], FLOOR_M, cap_m)
+    ground_truth = ground_truth[filled]
     return {name: float(metric(pred, ground_truth)) for name, metric in DEPTH_METRICS.items()} | scores
 
 
@@ -109,7 +110,8 @@ def evaluate_disparity(
     are ``None``.
     """
     kept = np.asarray(valid, bool)
-    error, ground_truth = np.abs(pred_px - ground_truth_px)[kept], ground_truth_px[kept]
+    error = np.abs(pred_px - ground_truth_px)[kept]
+    ground_truth = ground_truth_px[kept]
     filled = np.isfinite(error)
     error, ground_truth = error[filled], ground_truth[filled]
     scores: dict[str, float | None] = {}
@@ -178,9 +180,11 @@ def confidence_deciles(
     ``fraction`` of the pixels, mean ``predicted``, ``observed``, ``abs_rel``; ``None`` for an empty decile.
     """
     used = valid & answered(pred_m)
-    error, predicted = np.abs(pred_m[used] - ground_truth_m[used]) / ground_truth_m[used], confidence[used]
+    error = np.abs(pred_m[used] - ground_truth_m[used]) / ground_truth_m[used]
+    predicted = confidence[used]
     values = {"predicted": predicted, "observed": error < within, "abs_rel": error}
-    decile, classes = np.minimum((predicted * 10).astype(int), 9), list[dict[str, float | None]]()
+    decile = np.minimum((predicted * 10).astype(int), 9)
+    classes = list[dict[str, float | None]]()
     for inside in (decile == k for k in range(10)):
         means = {name: float(np.mean(v[inside])) if inside.any() else None for name, v in values.items()}
         classes.append({"fraction": float(inside.mean()) if inside.size else 0.0, **means})
@@ -199,7 +203,8 @@ def align(values: Map, ground_truth_m: Map, valid: Map, space: str = "depth") ->
     ``values`` is not, and everywhere if no pixel has ground truth and prediction. Source: Marigold's
     evaluation, ``least_square`` and ``least_square_disparity``, the latter over positive predictions only.
     """
-    kind, metre = SPACES[check_choice(space, "space", SPACES)], torch.ones((), dtype=torch.float64)
+    kind = SPACES[check_choice(space, "space", SPACES)]
+    metre = torch.ones((), dtype=torch.float64)
     known = valid & np.isfinite(values) & (ground_truth_m > 0)
     if space == "disparity":
         known &= np.nan_to_num(values) > 0
@@ -232,7 +237,8 @@ MAX_PX = 10.0
 
 def near_disparity_steps(disparity_px: Map, valid: Map) -> Map:
     """``(H, W)`` bool: pixels near a step of the ground-truth disparity between known neighbours."""
-    step, known_px = np.zeros(valid.shape, bool), np.where(valid, disparity_px, np.nan)
+    step = np.zeros(valid.shape, bool)
+    known_px = np.where(valid, disparity_px, np.nan)
     for near, px in ((step, known_px), (step.T, known_px.T)):
         is_step = np.abs(np.diff(px)) > STEP_PX
         near[:, 1:] |= is_step
@@ -244,8 +250,10 @@ def occluded_by_ground_truth(disparity_px: Map, valid: Map) -> Map:
     """``(H, W)`` bool: pixels occluded in the right view by ground-truth disparity larger by 1 px."""
     target = np.rint(np.arange(valid.shape[1]) - np.where(valid, disparity_px, 0.0)).astype(int)
     rows, columns = np.nonzero(valid & (target >= 0) & (target < valid.shape[1]))
-    shift, at = disparity_px[rows, columns], (rows, target[rows, columns])
-    nearest, hidden = np.full(valid.shape, -np.inf), np.zeros(valid.shape, bool)
+    shift = disparity_px[rows, columns]
+    at = (rows, target[rows, columns])
+    nearest = np.full(valid.shape, -np.inf)
+    hidden = np.zeros(valid.shape, bool)
     np.maximum.at(nearest, at, shift)
     hidden[rows, columns] = nearest[at] > shift + 1.0
     return hidden
@@ -255,7 +263,9 @@ def _front_of(depth_m: Map, known: Map) -> list[tuple[Map, Map]]:
     """Ratios of the right, left, lower and upper neighbour's depth to a pixel's, and where both are known."""
     pairs = []
     for depth, known_there in ((depth_m, known), (depth_m.T, known.T)):
-        first, second, both = depth[:, :-1], depth[:, 1:], known_there[:, :-1] & known_there[:, 1:]
+        first = depth[:, :-1]
+        second = depth[:, 1:]
+        both = known_there[:, :-1] & known_there[:, 1:]
         pairs += [(second / first, both), (first / second, both)]
     return pairs
 

@@ -89,7 +89,8 @@ def _cells_by_key(options: DirOptions, modules: Sequence[str]) -> Callable[[str]
 
 def run_pairs(name: str, options: DirOptions) -> Page | None:
     """Measure methods on pairs and write the tables; errors as in ``run_experiment``."""
-    refs, more = select(options), []
+    refs = select(options)
+    more = []
     if options.engine == "ray":
         _measure_on_ray(refs, options)
     if options.sample is not None:
@@ -151,7 +152,9 @@ NUMBERS = (
 def changes_table(records: Sequence[Record], name: str) -> Table:
     """Return all rows of ``CHANGES[name]`` that ran, with paired differences to the unchanged preset."""
     abs_rel, delta1 = (tables.metric_values(records, "raw", metric) for metric in ("abs_rel", "delta1"))
-    seconds, unchanged, rows = tables.by_method(records, itemgetter("seconds")), CHANGES[name][0][1], []
+    seconds = tables.by_method(records, itemgetter("seconds"))
+    unchanged = CHANGES[name][0][1]
+    rows = []
     for title, method in CHANGES[name]:
         values = abs_rel.get(method)
         if values:
@@ -179,9 +182,11 @@ FLATNESS = ("guided", *(_at(number, factor) for number in NUMBERS for factor in 
 def flatness_table(records: Sequence[Record]) -> Table:
     """Return mean AbsRel with each parameter at half and twice its value, and the largest pair change."""
     values = tables.metric_values(records, "raw", "abs_rel")
-    unchanged, rows = values.get("guided", {}), []
+    unchanged = values.get("guided", {})
+    rows = []
     for number in NUMBERS:
-        means, changes = list[str](), list[tuple[float, str]]()
+        means = list[str]()
+        changes = list[tuple[float, str]]()
         for factor in (0.5, 2.0):
             changed = values.get(_at(number, factor), {})
             shared = [label for label in changed if label in unchanged]
@@ -198,7 +203,8 @@ def flatness_table(records: Sequence[Record]) -> Table:
 
 def run_changes(name: str, options: PairsOptions) -> Page | None:
     """Change one part of the default at a time: its ``parts``, or the numbers of ``flatness``."""
-    flat, refs = name == "flatness", select(options)
+    flat = name == "flatness"
+    refs = select(options)
     methods = FLATNESS if flat else tuple(method for _, method in CHANGES[name])
 
     def page_tables(records: list[Record]) -> list[Table]:
@@ -228,7 +234,8 @@ class _Cost(NamedTuple):
 
 def cost_table(records: Sequence[Record]) -> Table:
     """Return seconds and memory of every method, absolute and relative to the plain pipeline."""
-    costs, rows = dict[str, _Cost](), []
+    costs = dict[str, _Cost]()
+    rows = []
     for method, group in tables.grouped((r for r in records if r["status"] == "ok"), "method").items():
         peak = max(record["peak_bytes"] for record in group)
         costs[method] = _Cost(len(group), statistics.median(record["seconds"] for record in group), peak)
@@ -276,7 +283,8 @@ def modules_of_datasets() -> list[str]:
 
 def fresh_process() -> ProcessPoolExecutor:
     """Return an executor of one new process that knows every registered data set."""
-    context, modules = get_context("spawn"), modules_of_datasets()
+    context = get_context("spawn")
+    modules = modules_of_datasets()
     return ProcessPoolExecutor(1, mp_context=context, initializer=_import_all, initargs=(modules,))
 
 
@@ -285,7 +293,8 @@ def run_cost(name: str, options: PairsOptions) -> Page:
     if not Shard.of(None).whole:
         bad_value("the number of processes", "1 for cost", Shard.of(None).count)
     refs = select(options)
-    records, taken = list[Record](), dict[str, int | None]()
+    records = list[Record]()
+    taken = dict[str, int | None]()
     alone = replace(options, out=options.out / "cost")
     for method in dict.fromkeys((*COST_METHODS, *options.methods)):
         prior = find_method(method).prior or options.prior

@@ -154,7 +154,8 @@ def layout_table(
     layout: Layout, columns: Sequence[Column], records: Sequence[Record], methods: Sequence[str]
 ) -> Table:
     """Return rows of other methods below the paper's; published cells are next to complete data sets."""
-    count, values = len(layout.metrics), dict[bool, list[tables.Values]]()
+    count = len(layout.metrics)
+    values = dict[bool, list[tables.Values]]()
     for kind in ("raw", "aligned"):
         values[kind == "aligned"] = [tables.metric_values(records, kind, metric) for metric in layout.metrics]
     groups = [("", 2)]
@@ -183,7 +184,8 @@ def layout_table(
 
 def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
     """Return all methods of a table: the paper's rows, additional ones, and the user's."""
-    layout, changed = LAYOUTS[name], ABLATED if name == "ablation" else ()
+    layout = LAYOUTS[name]
+    changed = ABLATED if name == "ablation" else ()
     printed = (row.method for row in layout.rows if not _is_outside(row.method))
     names = [*printed, *layout.methods, *added]
     return tuple(dict.fromkeys([*names, *(method for preset in changed for _, method in CHANGES[preset])]))
@@ -213,7 +215,9 @@ def _ablation_columns(options: PairsOptions) -> tuple[Column, ...]:
 
 def run_paper_table(name: str, options: PairsOptions) -> Page | None:
     """Measure one table of the paper and write it, with additional ``options.methods``."""
-    layout, posed, ablation = LAYOUTS[name], name == "table3", name == "ablation"
+    layout = LAYOUTS[name]
+    posed = name == "table3"
+    ablation = name == "ablation"
     if options.data is None and not ablation:
         obtain = " ".join(f"{c.title}: {DATASETS[c.datasets[0]].obtain}" for c in layout.columns)
         bad_value("--data", "given", "nothing", obtain)

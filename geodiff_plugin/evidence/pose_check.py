@@ -66,7 +66,8 @@ def check_poses(posed: PosedViews, fit: PoseFit, images: FactSheet, measured: bo
     """
     if not (fit.is_known or fit.surely):
         return _with_checks(posed, refine_by_flow(posed, fit, measured), images)
-    given, near = fit.greys.given, nearby_of(fit)
+    given = fit.greys.given
+    near = nearby_of(fit)
     sizes = [view.grey.shape for view in fit.greys.views]
     facts = measure(TracksStage(fit.tracks, given, near, sizes, posed.size))
     if fit.is_small and not rules_out_everything(facts):

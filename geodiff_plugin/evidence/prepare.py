@@ -72,7 +72,8 @@ def plan_evidence(
     checks = bool(given.views) and config.pose != "given" and checked is None
     if checks and leaves_cpu_free(left_01.device):
         return _matched_during_check(left_01, given, config, measured_baseline)
-    posed, points = given.posed_views(left_01), given.points_on(left_01.device)
+    posed = given.posed_views(left_01)
+    points = given.points_on(left_01.device)
     if not posed.rights:
         return prepare_evidence(posed, points, config)
     posed = _with_clean_images(posed, config)
@@ -92,8 +93,10 @@ def _matched_during_check(
     The views are matched with the poses as given, since most poses fit. Downscaled images usually show that
     they fit. Any further check then changes no view, and phase 3 is the first to need its result.
     """
-    tasks, plan = fit_in_background(given.with_left(left_01)), None
-    posed, points = given.posed_views(left_01), given.points_on(left_01.device)
+    tasks = fit_in_background(given.with_left(left_01))
+    plan = None
+    posed = given.posed_views(left_01)
+    points = given.points_on(left_01.device)
     clear = _with_clean_images(posed, config)
     if clear is not posed:
         tasks = fit_in_background(clear)
@@ -121,7 +124,11 @@ def prepare_evidence(native: PosedViews, points: Tensor | None, config: Guidance
     """
     needs_matches = config.needs_matches(points is not None)
     grid = matching.to_grid(native, config.sweep_pixels)
-    volume, matches, known_points, rows, facts = None, None, None, None, FactSheet()
+    volume = None
+    matches = None
+    known_points = None
+    rows = None
+    facts = FactSheet()
     outside = 0
     if points is not None:
         known_points, outside = matching.points_to_matches(points, native.left.camera, grid.size)

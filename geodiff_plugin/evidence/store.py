@@ -69,7 +69,8 @@ class EvidenceStore:
 
     def take_spared_seconds(self) -> float:
         """Return the seconds saved by the cache since the last call of this method, for benchmarks."""
-        spared, self._spared = self._spared, 0.0
+        spared = self._spared
+        self._spared = 0.0
         return spared
 
 

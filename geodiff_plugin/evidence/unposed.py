@@ -182,7 +182,8 @@ def estimate_rig(
     Ks, assumed = _cameras(unposed, images, K, fov, cropped)
     if known.baseline_m is not None:
         check_number(known.baseline_m, "baseline_m", 1e-6, 1e6)
-    size, cloud = image_size(images[0]), None
+    size = image_size(images[0])
+    cloud = None
     if known.points is not None:
         cloud = _as_cloud(as_points(known.points, "points"), Camera(Ks[0], size[::-1]).single())
     left = both(as_mask(masks[0], "mask", size), alpha_mask(unposed[0]))
@@ -195,7 +196,8 @@ def estimate_rig(
         raise with_code(UnknownPoseError(text), error.code) from None
     factor = found.tracks.K_left[0, 0] / Ks[0][0, 0]
     scale = find_scale(found.tracks, found.Ts, factor, known.baseline_m, known.known_length, cloud)
-    Ts, poses = found.Ts.copy(), found.poses
+    Ts = found.Ts.copy()
+    poses = found.poses
     Ts[:, :3, 3] *= scale.factor
     of_poses = [finding for pose in poses for finding in pose.findings]
     return EstimatedRig(

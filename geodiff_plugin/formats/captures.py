@@ -304,7 +304,8 @@ def _stored_orientation(frames: Sequence[CaptureFrame]) -> list[Finding]:
 
 def _other_sizes(candidates: Sequence[Candidate]) -> list[Finding]:
     """Return a finding on images whose size is close to, but not equal to, their cameras' size."""
-    names, sizes = list[str](), ""
+    names = list[str]()
+    sizes = ""
     for each in candidates:
         if each.problem or each.camera is None or each.camera.size is None:
             continue

@@ -56,7 +56,8 @@ def flying_points(depth_m: np.ndarray) -> np.ndarray:
     padded = np.pad(np.where(use, depth_m, np.nan), 1, constant_values=np.nan)
     flying = np.empty(depth_m.shape, dtype=bool)
     for rows in row_strips(height, width):
-        count, strip = rows.stop - rows.start, padded[rows.start : rows.stop + 2]
+        count = rows.stop - rows.start
+        strip = padded[rows.start : rows.stop + 2]
         centre = strip[1:-1, 1:-1]
         support = np.zeros(centre.shape, dtype=np.int8)
         for dy, dx in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
@@ -103,9 +104,11 @@ def _cloud_strips(
     depth_m, image_01 = np.asarray(depth_m), np.asarray(image_01)
     if depth_m.ndim != 2 or image_01.shape != (*depth_m.shape, 3):
         bad_value("image_01", "(H, W, 3) over a depth of (H, W)", f"{image_01.shape} over {depth_m.shape}")
-    K, u = check_intrinsics(K), np.arange(depth_m.shape[1])
+    K = check_intrinsics(K)
+    u = np.arange(depth_m.shape[1])
     for rows in row_strips(*depth_m.shape):
-        z, v = depth_m[rows].astype(np.float64), np.arange(rows.start, rows.stop)[:, None]
+        z = depth_m[rows].astype(np.float64)
+        v = np.arange(rows.start, rows.stop)[:, None]
         used = np.flatnonzero(_usable(z, None if valid is None else valid[rows]))
         points = [(each * z).ravel()[used] for each in (*rays_of_pixels(K, u, v), 1.0)]
         colours = np.take(in_8_bits(image_01[rows]).reshape(-1, 3), used, axis=0)  # faster than indexing
@@ -147,7 +150,10 @@ def make_mesh(
     u, v = np.meshgrid(columns, rows)
     points = Camera(check_intrinsics(K)).rays(np.stack([u, v], -1)) * z[..., None]
     index = np.arange(z.size).reshape(z.shape)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    a = index[:-1, :-1]
+    b = index[:-1, 1:]
+    c = index[1:, :-1]
+    d = index[1:, 1:]
     whole = cut[:-1, :-1] == 0
     faces = np.concatenate([np.stack(part, -1)[whole] for part in ((a, c, b), (b, c, d))])
     uv = np.stack([(u + 0.5) / sides[1], 1.0 - (v + 0.5) / sides[0]], -1)
@@ -228,12 +234,14 @@ def write_glb(
     import trimesh
 
     if isinstance(shape, Cloud):
-        name, cloud = "cloud", shape.thinned(GLB_POINTS)
+        name = "cloud"
+        cloud = shape.thinned(GLB_POINTS)
         geometry: Any = trimesh.PointCloud(cloud.points_m, colors=cloud.colours)
     else:  # a mesh's own copy loses the JPEG format of the texture
         name = "mesh"
         geometry = trimesh.Trimesh(shape.vertices, shape.faces, visual=shape.visual, process=False)
-    scene, length_m = trimesh.Scene(), 1.0
+    scene = trimesh.Scene()
+    length_m = 1.0
     if len(geometry.vertices):
         length_m = PYRAMID_FRACTION * float(np.median(geometry.vertices[:, 2]))
         scene.add_geometry(geometry, geom_name=name)

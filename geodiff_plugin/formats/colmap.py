@@ -170,7 +170,9 @@ class _Bytes:
     """Reads groups of little-endian numbers of a file; ``"z"`` is a zero-terminated text."""
 
     def __init__(self, path: Path) -> None:
-        self._data, self._at, self._path = path.read_bytes(), 0, path
+        self._data = path.read_bytes()
+        self._at = 0
+        self._path = path
 
     def __call__(self, layout: str) -> tuple[Any, ...]:
         if layout == "z":

@@ -61,7 +61,8 @@ def read_euroc(path: Path) -> Layout | None:
 def _euroc(folder: Path, ground_truth: Path) -> Layout:
     images = folder / "cam0" / "data"
     entries = euroc_cameras((read_text(folder / "cam0" / "sensor.yaml", "sensor.yaml"),))[0]
-    camera, T_body_camera = EUROC.camera(entries, "cam0"), EUROC.pose_of(entries, "cam0").world_from_camera
+    camera = EUROC.camera(entries, "cam0")
+    T_body_camera = EUROC.pose_of(entries, "cam0").world_from_camera
     rows = array_of(
         [row[:8] for row in read_rows(ground_truth, f"{ground_truth}", "poses")], (-1, 8), "lines of 8"
     )
@@ -84,7 +85,8 @@ def _euroc(folder: Path, ground_truth: Path) -> Layout:
 
 def read_tartanair(path: Path) -> Layout | None:
     """Read TartanAir's left camera: ``image_left/``, ``pose_left.txt`` (own axes), ``depth_left/*.npy``."""
-    file, images = path / "pose_left.txt", images_in(path / "image_left")
+    file = path / "pose_left.txt"
+    images = images_in(path / "image_left")
     if not (file.is_file() and images):
         return None
 
@@ -100,7 +102,8 @@ def read_tartanair(path: Path) -> Layout | None:
 def read_kitti_odometry(path: Path) -> Layout | None:
     """Read a KITTI odometry sequence: ``calib.txt``, ``image_2/``, and poses of camera 0 as 3x4 lines."""
     folder, number = next(((path / f, n) for f, n in KITTI_IMAGES if images_in(path / f)), (path, 0))
-    place, calib = path.resolve(), path / "calib.txt"
+    place = path.resolve()
+    calib = path / "calib.txt"
     named = f"{place.name}.txt"
     poses = (path / "poses.txt", path / named, place.parent.parent / "poses" / named)
     file = next((at for at in poses if at.is_file()), None)
@@ -108,7 +111,8 @@ def read_kitti_odometry(path: Path) -> Layout | None:
         return None
     P = {row[0].rstrip(":"): row[1:] for row in read_rows(calib, f"{calib}", "projections")}
     projection = array_of(P[f"P{number}"], (3, 4), f"P{number}")
-    K, shift = projection[:, :3], np.eye(4)
+    K = projection[:, :3]
+    shift = np.eye(4)
     shift[:3, 3] = -np.linalg.solve(K, projection[:, 3])  # the camera's position in camera 0's frame
 
     def build(frame: CaptureFrame, row: list[str]) -> Candidate:

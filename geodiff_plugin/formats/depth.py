@@ -86,7 +86,8 @@ def read_depth_png(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read a 16-bit PNG as ``(H, W)`` float32 in metres or pixels, and its mask of nonzero pixels."""
     with open_image(path, name, "a 16-bit PNG file") as image:
-        mode, values = image.mode, np.asarray(image)
+        mode = image.mode
+        values = np.asarray(image)
     if not mode.startswith("I"):
         hint = "An 8-bit copy does not contain the values."
         bad_value(name, "a 16-bit grey PNG file", f"{path} of mode {mode}", hint)

@@ -75,7 +75,8 @@ def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         cameras.append(RawCamera(K, ZED_SIZES[name], [lens.get(key, 0.0) for key in keys]))
     # Keys are lower case here. Some files have them per resolution (TY_HD), others once for all (TY); files
     # of the first cameras lack them.
-    stereo, at = sections["STEREO"], f"_{name.lower()}"
+    stereo = sections["STEREO"]
+    at = f"_{name.lower()}"
     shift = [stereo["baseline"], *(stereo.get(key + at, stereo.get(key, 0.0)) for key in ("ty", "tz"))]
     turn = array_of([stereo[key + at] for key in ("rx", "cv", "rz")], (3,), "RX, CV, RZ of [STEREO]")
     shift_m = -array_of(shift, (3,), "Baseline, TY, TZ of [STEREO]") / MM_PER_METRE
@@ -182,9 +183,11 @@ def _oak_camera(cameras: Sockets, socket: int, choice: CameraChoice, with_lens: 
 
 def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
     """Return the transform in metres from ``socket`` to every camera linked to it."""
-    reached, T = {socket: np.eye(4)}, np.eye(4)
+    reached = {socket: np.eye(4)}
+    T = np.eye(4)
     while True:
-        link, where = cameras[socket]["extrinsics"], f"extrinsics of socket {socket}"
+        link = cameras[socket]["extrinsics"]
+        where = f"extrinsics of socket {socket}"
         socket = _socket(link["toCameraSocket"])
         if socket not in cameras or socket in reached:
             return reached

@@ -52,7 +52,8 @@ MATRIX = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
 
 def posix_path(path: PathLike) -> Path:
     """Return the path of a file, whose folders may be separated by backslashes as on Windows."""
-    file, slashed = Path(path), Path(os.fspath(path).replace("\\", "/"))
+    file = Path(path)
+    slashed = Path(os.fspath(path).replace("\\", "/"))
     return slashed if os.path.exists(slashed) and not os.path.exists(file) else file
 
 
@@ -188,7 +189,8 @@ def exif_of(image: Image.Image) -> Image.Exif:
 
 def _ends_with_pixels(file: IO[bytes]) -> bool:
     """Whether a PNG file has no chunks after its pixels."""
-    here, kinds = file.seek(0, os.SEEK_CUR), list[bytes]()
+    here = file.seek(0, os.SEEK_CUR)
+    kinds = list[bytes]()
     try:
         file.seek(len(PNG_SIGNATURE))
         while kinds[-1:] != [b"IEND"]:

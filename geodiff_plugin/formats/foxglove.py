@@ -65,7 +65,9 @@ class FoxgloveReader(AbstractContextManager["FoxgloveReader"]):
             from mcap_protobuf.decoder import DecoderFactory
         except ImportError:
             raise_input_error(INSTALL)
-        self._path, self._make, self._factory = path, make_reader, DecoderFactory()
+        self._path = path
+        self._make = make_reader
+        self._factory = DecoderFactory()
         self._decoders: dict[str, Any] = {}
         self.connections: list[Connection] = []
 

@@ -142,7 +142,8 @@ def find_packing(frames: Sequence[np.ndarray], name: str, path: Path | None = No
 
 def _inferred(packing: Packing, name: str, view: Size, source: str, lead: float) -> Finding:
     """Report an inferred layout of views ``(width, height)``, as an assumption unless its lead is clear."""
-    layout, squeeze = packing.layout, ""
+    layout = packing.layout
+    squeeze = ""
     if packing.stretch != (1, 1):
         stored, shown = ("{}x{}".format(*each) for each in (view, packing.shown_size(view)))
         squeeze = f" K is for a view of {shown} and is scaled to {stored}, as in the file."
@@ -175,12 +176,11 @@ def _similarity(grey: np.ndarray, axis: int) -> float:
     """Return the correlation of both halves of a frame ``(H, W)``, reduced, for the best shift along rows."""
     halves = np.array_split(grey[: grey.shape[0] // 2 * 2, : grey.shape[1] // 2 * 2], 2, axis=axis)
     left, right = (cv2.resize(half, REDUCED, interpolation=cv2.INTER_AREA) for half in halves)
-    width, best = REDUCED[0], -1.0
+    width = REDUCED[0]
+    best = -1.0
     for shift in range(-MAX_SHIFT, MAX_SHIFT + 1):
-        a, b = (
-            left[:, max(0, shift) : width + min(0, shift)],
-            right[:, max(0, -shift) : width + min(0, -shift)],
-        )
+        a = left[:, max(0, shift) : width + min(0, shift)]
+        b = right[:, max(0, -shift) : width + min(0, -shift)]
         a, b = a - a.mean(), b - b.mean()
         scale = math.sqrt(float((a * a).sum() * (b * b).sum()))
         best = max(best, float((a * b).sum()) / scale if scale > 0 else 0.0)

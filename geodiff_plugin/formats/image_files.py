@@ -152,7 +152,8 @@ def _images_below(top: Path, other: Sequence[str]) -> Iterator[Path]:
     """Yield the images in a folder and its subfolders that may be searched."""
     listed = 0
     for at, folders, files in os.walk(top):
-        place, listed = Path(at), listed + len(folders) + len(files)
+        place = Path(at)
+        listed = listed + len(folders) + len(files)
         if listed > MAX_LISTED:
             return
         if place != top and any(name in (*folders, *files) for name in OTHER_CAMERAS):

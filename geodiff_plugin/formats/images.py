@@ -78,7 +78,8 @@ def has_alpha(image: Image.Image) -> bool:
 
 def _file_findings(image: Image.Image, name: str) -> list[Finding]:
     """Return findings on an opened image before decoding: several frames, or 16-bit colour read as 8 bits."""
-    findings, frames = list[Finding](), getattr(image, "n_frames", 1)
+    findings = list[Finding]()
+    frames = getattr(image, "n_frames", 1)
     if frames > 1 and image.format in SEVERAL:
         sentence = f"{name} holds {frames} frames or pages; only the first is used."
         findings.append(Finding("image.frames", sentence))
@@ -96,7 +97,8 @@ def _dark_findings(maximum: int, name: str) -> list[Finding]:
 
 def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[Finding]]:
     """Convert ``(H, W)`` or ``(H, W, C)`` to ``(H, W, 3)`` float32 in [0, 1]; also return findings."""
-    value, findings = value[..., None] if value.ndim == 2 else value, list[Finding]()
+    value = value[..., None] if value.ndim == 2 else value
+    findings = list[Finding]()
     if value.shape[-1] == 4:
         value = value[..., :3]
         findings.append(
@@ -167,7 +169,8 @@ def pages_of_both(path: PathLike, name: str) -> tuple[int, int]:
     ``ster`` is the left view.
     """
     with open_image(path, name) as image:
-        count, is_heic = int(getattr(image, "n_frames", 1)), image.format == "HEIF"
+        count = int(getattr(image, "n_frames", 1))
+        is_heic = image.format == "HEIF"
         entries = (getattr(image, "mpinfo", None) or {}).get(MPO_ENTRIES) or ()
         kinds = [str(entry["Attribute"]["MPType"]) for entry in entries]
         groups = image.info.get("entity_groups") or ()
@@ -196,7 +199,8 @@ def _hwc(value: Any, name: str) -> np.ndarray:
         channels, shape, turn = 0, "(3, H, W)", "For torch, put channels first: value.permute(2, 0, 1)."
     else:
         value = value[..., None] if value.ndim == 2 else value
-        channels, shape = -1, "(H, W, 3) or (H, W)"
+        channels = -1
+        shape = "(H, W, 3) or (H, W)"
         turn = "For numpy, put channels last: value.transpose(1, 2, 0)."
     if value.ndim != 3 or value.shape[channels] not in CHANNELS:
         hints = {2: "Add a channel axis: value[None].", 3: turn, 4: "Pass a batch as a list: list(value)."}

@@ -212,8 +212,11 @@ class Images:
         searched: str,
         findings: tuple[Finding, ...] = (),
     ) -> None:
-        self.names, self.findings = list(names), findings
-        self._files, self._problem, self._used = files, f"{NO_IMAGE} in {searched}", set[str]()
+        self.names = list(names)
+        self.findings = findings
+        self._files = files
+        self._problem = f"{NO_IMAGE} in {searched}"
+        self._used = set[str]()
 
     @classmethod
     def find(
@@ -266,7 +269,8 @@ class Images:
     def _candidate(
         self, name: str, entry: Entry, build: Callable[[CaptureFrame, Entry], Candidate]
     ) -> Candidate:
-        file, twice = self._files[name], name in self._used
+        file = self._files[name]
+        twice = name in self._used
         self._used.add(name)
         if file is not None and not twice:
             return build_frame(CaptureFrame(file.stem, file), build, entry)

@@ -46,7 +46,8 @@ def read_map_file(path: PathLike, name: str = "map") -> np.ndarray:
 def _image_map(file: Path, name: str) -> np.ndarray:
     """Read a PNG or TIFF of one channel, of 16 bits or floats."""
     with open_image(file, name, "a map of 16 bits or floats") as image:
-        mode, values = image.mode, np.asarray(image)
+        mode = image.mode
+        values = np.asarray(image)
     if mode == "F":
         return values
     if mode == "RGBA" and (floats := _floats_of_bytes(values)) is not None:

@@ -43,9 +43,11 @@ def read_matlab(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     data = json.loads(texts[0])
     left, right = (_matlab_camera(data[f"CameraParameters{n}"]) for n in (1, 2))
     if "PoseCamera2" in data:
-        R, t = np.array(data["PoseCamera2"]["R"], float), data["PoseCamera2"]["Translation"]
+        R = np.array(data["PoseCamera2"]["R"], float)
+        t = data["PoseCamera2"]["Translation"]
     else:
-        R, t = np.array(data["RotationOfCamera2"], float).T, data["TranslationOfCamera2"]
+        R = np.array(data["RotationOfCamera2"], float).T
+        t = data["TranslationOfCamera2"]
     unit = str(data["CameraParameters1"].get("WorldUnits") or DEFAULT_UNIT).lower()
     if unit not in UNITS:
         bad_value("WorldUnits", f"one of {', '.join(UNITS)}", unit)

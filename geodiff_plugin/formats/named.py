@@ -113,7 +113,8 @@ def _names(field: str) -> list[str]:
 
 def _table(first: int) -> dict[str, str]:
     """Map each normalised name to K1, K2, D1 etc.; ``first`` is the number of the left camera."""
-    table, of_camera = dict(OTHERS), {"K": "K", "D": "lens", "P": "projection"}
+    table = dict(OTHERS)
+    of_camera = {"K": "K", "D": "lens", "P": "projection"}
     for letter, field in (of_camera | {"R": "rotation", "T": "translation"}).items():
         table |= dict.fromkeys(_names(field), letter)
     numbers = NUMBERED[first]

@@ -70,7 +70,8 @@ def read_openmvg(path: Path, images_at: Path | None = None) -> Layout | None:
     file, data = found
     views = [_flat(each) for each in data["views"]]
     names = [f"{view['local_path']}/{view['filename']}".lstrip("/") for view in views]
-    cameras, classes = dict[int, tuple[str, Entries]](), dict[int, str]()
+    cameras = dict[int, tuple[str, Entries]]()
+    classes = dict[int, str]()
     for each in data["intrinsics"]:
         number = int(each["value"]["polymorphic_id"])
         if number >= FIRST_OF_CLASS:
@@ -98,7 +99,8 @@ def _openmvg_camera(kind: str, data: Entries) -> RawCamera:
         bad_value("the camera", f"one of {', '.join(OPENMVG_LENSES)}", kind, UNDISTORT)
     model, entry = OPENMVG_LENSES[kind]
     numbers = data[entry] if entry else ()
-    f, size = data["focal_length"], (data["width"], data["height"])
+    f = data["focal_length"]
+    size = (data["width"], data["height"])
     coefficients = numbers if model == "fisheye" else _opencv_order(numbers)
     return RawCamera(intrinsics(f, f, *data["principal_point"]), size, coefficients, model)
 
@@ -119,7 +121,8 @@ def read_alicevision(path: Path, images_at: Path | None = None) -> Layout | None
         E = pose and _pose(array_of(pose["rotation"], (3, 3), "rotation").T, pose["center"])
         return posed(frame, E, camera and _alicevision_camera(camera, version))
 
-    views, folders = data["views"], image_folders(file.parent, file.parent.parent)
+    views = data["views"]
+    folders = image_folders(file.parent, file.parent.parent)
     images = Images.find([str(view["path"]) for view in views], folders, file, images_at)
     return images.layout("AliceVision", views, build)
 

@@ -166,7 +166,8 @@ def locked_folder(folder: Path, *, shared: bool = False) -> Iterator[None]:
             except OSError as error:
                 raise_unwritable(folder, error)
             if file is None:
-                got, hint = f"{folder}, which another run is using", "Wait for it, or choose another."
+                got = f"{folder}, which another run is using"
+                hint = "Wait for it, or choose another."
                 bad_value("--out", "a folder that no other run uses", got, hint)
             stack.callback(_unlock, path, file)
         yield
@@ -224,7 +225,8 @@ class HeldFolder:
         if not self.target.is_dir():
             os.rename(files, self.target)
             return
-        written, earlier = {path.name for path in files.iterdir()}, files_of_report(self.target)
+        written = {path.name for path in files.iterdir()}
+        earlier = files_of_report(self.target)
         for name in sorted(written - {REPORT}):
             os.replace(files / name, self.target / name)
         for path in (self.target / name for name in earlier - written):
@@ -242,7 +244,9 @@ class OutFolder:
     """
 
     def __init__(self, path: Path, *, inputs: Collection[Path] = (), overwrite: bool = False) -> None:
-        self.path, self._inputs, self._overwrite = Path(path), inputs, overwrite
+        self.path = Path(path)
+        self._inputs = inputs
+        self._overwrite = overwrite
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -276,7 +280,8 @@ class OutFolder:
 
     def _begin(self, stack: ExitStack) -> None:
         """Create and lock the hidden folder, and delete leftovers of a killed run."""
-        staging, sibling = self._staging, _sibling(self._target)
+        staging = self._staging
+        sibling = _sibling(self._target)
         for path in reversed([path for path in (staging, *staging.parents) if not path.exists()]):
             path.mkdir(exist_ok=True)
             stack.callback(_remove_empty, path)

@@ -47,7 +47,8 @@ def read_pcd_points(path: Path, name: str = "points") -> np.ndarray:
     if head is None:
         bad_value(name, "a whole PCD file", path, HINT)
     try:
-        layout, body = _layout(head.group().decode("ascii", errors="replace")), data[head.end() :]
+        layout = _layout(head.group().decode("ascii", errors="replace"))
+        body = data[head.end() :]
         reader = {b"ascii": _ascii, b"binary": _binary, b"binary_compressed": _compressed}[head.group(1)]
         xyz = reader(body, layout)
     except Exception:  # any error that a damaged file may cause
@@ -85,7 +86,8 @@ def _compressed(body: bytes, layout: _Layout) -> np.ndarray:
     if size != layout.points * layout.row.itemsize:
         raise_input_error(DAMAGED)
     plain = _decompressed(body[SIZES_BYTES : SIZES_BYTES + packed], size)
-    columns, start = {}, 0
+    columns = {}
+    start = 0
     for field in layout.row.names or ():
         kind = layout.row[field]  # includes the field's count
         columns[field] = np.frombuffer(plain, kind, layout.points, start).reshape(layout.points, -1)[:, 0]
@@ -95,7 +97,8 @@ def _compressed(body: bytes, layout: _Layout) -> np.ndarray:
 
 def _decompressed(data: bytes, size: int) -> bytes:
     """Decompress LZF: runs of literal bytes, and copies of bytes ``distance`` earlier."""
-    plain, at = bytearray(), 0
+    plain = bytearray()
+    at = 0
     while at < len(data) and len(plain) <= size:
         control = data[at]
         at += 1
@@ -109,7 +112,8 @@ def _decompressed(data: bytes, size: int) -> bytes:
             at += 1
         distance = ((control & 0x1F) << 8) + data[at] + 1
         at += 1
-        start, length = len(plain) - distance, length + 2
+        start = len(plain) - distance
+        length = length + 2
         if start < 0:
             raise_input_error(DAMAGED)
         pattern = bytes(plain[start : start + length])  # shorter if the copy overlaps itself

@@ -134,7 +134,8 @@ def read_stray(path: Path) -> Layout | None:
 def read_arkitscenes(path: Path) -> Layout | None:
     """Read an ARKitScenes scene: ``lowres_wide/``, its ``.traj`` (world-to-camera) and ``.pincam`` files."""
     for folder in (path, path / f"{path.resolve().name}_frames"):
-        images, file = images_in(folder / "lowres_wide"), folder / "lowres_wide.traj"
+        images = images_in(folder / "lowres_wide")
+        file = folder / "lowres_wide.traj"
         if images and file.is_file():
             return _arkitscenes(folder, file, images)
     return None

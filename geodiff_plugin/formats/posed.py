@@ -174,7 +174,8 @@ def _numbers(entries: Entries, keys: str, name: str) -> np.ndarray:
 
 def _pose(entries: Entries, keys: str, name: str) -> np.ndarray:
     first, *_ = (_numbers(entries, key, name) for key in keys.split())
-    numbers, what = _numbers(entries, keys, name), f"{keys} of {name}"
+    numbers = _numbers(entries, keys, name)
+    what = f"{keys} of {name}"
     if first.size == 9:
         return transform(first, numbers[9:], what)
     if numbers.size == 6:
@@ -306,7 +307,8 @@ def multical_cameras(texts: tuple[str, ...]) -> Cameras:
 def multical_pose(cameras: Cameras, number: int) -> Pose:
     """Return the world-to-camera pose; ``LEFT_to_RIGHT`` is LEFT's pose with RIGHT as world."""
     name, poses = cameras[number]["name"], cameras[number]["poses"]
-    T, at = np.eye(4), name
+    T = np.eye(4)
+    at = name
     for _ in poses:
         key = at if at in poses else next((key for key in poses if key.startswith(f"{at}_to_")), None)
         if key is None:
@@ -330,7 +332,8 @@ def _mrcal_camera(text: str) -> Entries:
         model = None
     if not isinstance(model, dict):
         bad_value("the file", "a camera model of mrcal", "another text", "The file may be truncated.")
-    numbers, kind = array_of(model["intrinsics"], (-1,), "intrinsics"), str(model["lensmodel"])
+    numbers = array_of(model["intrinsics"], (-1,), "intrinsics")
+    kind = str(model["lensmodel"])
     if kind in MRCAL_COUNTS:
         array_of(numbers[4:], (MRCAL_COUNTS[kind],), "the coefficients in intrinsics")
     key = "rt_cam_ref" if "rt_cam_ref" in model else "extrinsics"  # current and older name

@@ -130,7 +130,8 @@ def read_calibration(
         ValueError: unknown or truncated format, missing cameras, or lens distortion unless ``distorted``.
     """
     texts = _texts(path)
-    entry, source = _format_of(texts), " and ".join(map(str, texts))
+    entry = _format_of(texts)
+    source = " and ".join(map(str, texts))
     if cameras is not None and not entry.uses_cameras:
         bad_value("cameras", "omitted for a file of two cameras", cameras, "It selects among more than two.")
     choice = CameraChoice(cameras, image_folder_hint, image_names, image_size, baseline_m)

@@ -72,7 +72,8 @@ def video_facts(
     Calls ``see`` with the time in seconds and BGR pixels ``(H, W, 3)`` uint8 of each frame, until it returns
     ``False``. Phones record at a variable rate, so the times are those in the container.
     """
-    capture, times = _open_video(path, name), list[float]()
+    capture = _open_video(path, name)
+    times = list[float]()
     while capture.grab():
         times.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0)
         if see is not None and not see(times[-1], capture.retrieve()[1]):
@@ -91,7 +92,8 @@ def _frame_times(times: Sequence[float], fps: float) -> tuple[float, ...]:
 
     Some backends of OpenCV report no times. Then the rate is taken as constant.
     """
-    given, even = np.asarray(times) - times[0], np.arange(len(times)) / fps
+    given = np.asarray(times) - times[0]
+    even = np.arange(len(times)) / fps
     if not (np.diff(given) > 0).all() or np.abs(given - even).max() < ROUNDED_TIME_S:
         return tuple(even.tolist())
     return tuple(given.tolist())
@@ -102,7 +104,8 @@ class VideoReader(AbstractContextManager["VideoReader"]):
 
     def __init__(self, path: Path, name: str = "video") -> None:
         self._path, self._name = path, name
-        self._capture, self._next = _open_video(path, name), 0
+        self._capture = _open_video(path, name)
+        self._next = 0
 
     def __exit__(self, *_: object) -> None:
         self._capture.release()
@@ -111,7 +114,8 @@ class VideoReader(AbstractContextManager["VideoReader"]):
         """Read one frame by number from 0, ``(H, W, 3)`` float32 in [0, 1], RGB."""
         if frame < self._next:
             self._capture.release()
-            self._capture, self._next = _open_video(self._path, self._name), 0
+            self._capture = _open_video(self._path, self._name)
+            self._next = 0
         while self._next < frame and self._capture.grab():
             self._next += 1
         read, image = self._capture.read() if self._next == frame else (False, None)
@@ -127,7 +131,8 @@ def sample_frames(path: Path, count: int, samples: int) -> list[np.ndarray]:
 
     Seeks, which is fast but may return a neighbouring frame.
     """
-    capture, images = _open_video(path, "video"), []
+    capture = _open_video(path, "video")
+    images = []
     for k in range(samples):
         capture.set(cv2.CAP_PROP_POS_FRAMES, (2 * k + 1) * count // (2 * samples))
         read, image = capture.read()
@@ -207,7 +212,8 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
     except Exception as error:  # any error that a damaged bag may cause
         reason = str(error).partition("\n")[0] or type(error).__name__
         bad_value("LEFT", "a whole bag", f"{path} ({reason})", "It may be truncated.")
-    pairs, free = [], stamps[1]
+    pairs = []
+    free = stamps[1]
     for left in stamps[0]:
         at = bisect.bisect(free, left)
         around = free[max(0, at - 1) : at + 1]
@@ -227,7 +233,9 @@ class BagReader(AbstractContextManager["BagReader"]):
     """Reads both images of the pairs of ``list_pairs``, side by side as in a video; a context manager."""
 
     def __init__(self, path: Path, topics: tuple[str, str], tolerance_s: float) -> None:
-        self._path, self._pairs, self._reader = path, list_pairs(path, topics, tolerance_s), _open_bag(path)
+        self._path = path
+        self._pairs = list_pairs(path, topics, tolerance_s)
+        self._reader = _open_bag(path)
         self._reader.open()
         self._connections = [_connections(self._reader, path, topic) for topic in topics]
 
@@ -289,12 +297,14 @@ def write_depth_bag(path: Path, frames: Iterable[BagFrame], frame_id: str, encod
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
-    is_ros2, count = path.suffix != ".bag", 0
+    is_ros2 = path.suffix != ".bag"
+    count = 0
     store: Any = get_typestore(Stores.ROS2_HUMBLE if is_ros2 else Stores.ROS1_NOETIC)
     plugin: dict[str, Any] = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
     serialize = store.serialize_cdr if is_ros2 else store.serialize_ros1
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        made, topics = Path(folder) / "depth", dict[str, Any]()
+        made = Path(folder) / "depth"
+        topics = dict[str, Any]()
         writer: Any = rosbag2.Writer(made, **plugin) if is_ros2 else rosbag1.Writer(made)
         with writer:
             for frame in frames:

@@ -119,10 +119,13 @@ def read_tracked(folder: Path) -> Layout | None:
         paths = images_of(folder.glob(of.images)) if folder.is_dir() else []
         if not (paths and (folder / of.pose).parent.is_dir()):
             continue
-        camera, info, candidates = _file_camera(folder, of.camera), _info_of(folder), []
+        camera = _file_camera(folder, of.camera)
+        info = _info_of(folder)
+        candidates = []
         per_m = None if info is None else info.depth_per_m
         for path in paths:
-            name, E = path.name.partition(".")[0], None
+            name = path.name.partition(".")[0]
+            E = None
             file = folder / of.pose.format(name)
             with suppress(InputError):
                 E = rigid(read_matrix(file, f"{file}"), f"the pose in {file}")
@@ -167,7 +170,8 @@ def _camera_of_info(entries: dict[str, str], which: str) -> RawCamera:
 
 def read_replica(folder: Path) -> Layout | None:
     """Read Replica as rendered by NICE-SLAM: ``results/frame*.jpg``, one pose per line, in metres."""
-    images, file = images_of(folder.glob("results/frame*")), folder / "traj.txt"
+    images = images_of(folder.glob("results/frame*"))
+    file = folder / "traj.txt"
     if not (images and file.is_file()):
         return None
     params = next((at for at in (folder, folder.parent) if (at / REPLICA_CAMERA).is_file()), None)
@@ -176,7 +180,8 @@ def read_replica(folder: Path) -> Layout | None:
         with reading_file(params / REPLICA_CAMERA, "cam_params.json of Replica"):
             entries = json.loads(read_text(params / REPLICA_CAMERA, REPLICA_CAMERA))["camera"]
             K = intrinsics(*(entries[key] for key in ("fx", "fy", "cx", "cy")))
-            camera, per_m = RawCamera(K, (entries["w"], entries["h"])), float(entries["scale"])
+            camera = RawCamera(K, (entries["w"], entries["h"]))
+            per_m = float(entries["scale"])
     rows = read_rows(file, f"{file}", "poses, one per line")
     if len(rows) < len(images):
         bad_value(f"{file}", f"a file with {len(images)} lines, one per image", f"{len(rows)}")
@@ -194,7 +199,8 @@ def read_tum(folder: Path) -> Layout | None:
     associations = next((file for name in TUM_ASSOCIATIONS if (file := folder / name).is_file()), None)
     if not ((folder / "rgb.txt").is_file() or associations) or not (folder / "groundtruth.txt").is_file():
         return None
-    camera, candidates = _file_camera(folder, _freiburg(folder)), list[Candidate]()
+    camera = _file_camera(folder, _freiburg(folder))
+    candidates = list[Candidate]()
     pose_at = read_trajectory(folder / "groundtruth.txt")
     if associations is not None and not (folder / "rgb.txt").is_file():
         images, depths = _associated_names(associations)
@@ -268,7 +274,8 @@ class TimedPoses:
         """Return the camera-to-world pose ``(4, 4)`` at a time."""
         if np.abs(self.times - t).min() > MAX_TIME_DIFFERENCE_S:
             return None
-        t, E = float(np.clip(t, self.times[0], self.times[-1])), np.eye(4)
+        t = float(np.clip(t, self.times[0], self.times[-1]))
+        E = np.eye(4)
         E[:3, :3] = self._turns(t).as_matrix()
         E[:3, 3] = [np.interp(t, self.times, along) for along in self._places.T]
         return E
@@ -298,7 +305,8 @@ def _unmatched_times(
 
     ``times`` are the trajectory's, in seconds; ``poses`` has the pose of every frame.
     """
-    found, last = sum(E is not None for E in poses), facts.times[-1]
+    found = sum(E is not None for E in poses)
+    last = facts.times[-1]
     span = f"{times[0]:g} to {times[-1]:g} s"
     if found == 0:
         hint = _hint_for_times(times, last)

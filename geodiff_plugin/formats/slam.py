@@ -76,7 +76,8 @@ def read_stvo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 def _orb_camera(entries: Entries, name: str, kind: str) -> RawCamera:
     """Return a camera by name; a pinhole may omit zero coefficients."""
-    keys, default = ("fx", "fy", "cx", "cy", *ORB_LENSES.get(kind, ())), 0.0 if kind == "PinHole" else None
+    keys = ("fx", "fy", "cx", "cy", *ORB_LENSES.get(kind, ()))
+    default = 0.0 if kind == "PinHole" else None
     given = {key: entries.get(f"{name}.{key}".lower(), default if key[0] in "kp" else None) for key in keys}
     numbers = [array_of(value, (), f"{name}.{key}") for key, value in given.items()]
     size = [entries.get(f"camera.{side}", [None])[0] for side in ("width", "height")]

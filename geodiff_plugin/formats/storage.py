@@ -55,7 +55,8 @@ class _Loader(yaml.SafeLoader):
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Compose a node; raise an error for aliases that contain others, or too many aliases."""
-        is_alias, before = self.check_event(yaml.events.AliasEvent), self._aliases
+        is_alias = self.check_event(yaml.events.AliasEvent)
+        before = self._aliases
         node = super().compose_node(parent, index)
         if is_alias:
             self._aliases += 1
@@ -81,7 +82,8 @@ def read_yaml(text: str) -> Entries:
     try:
         content = next(yaml.load_all(text, _Loader), None)  # noqa: S506  (a safe one)
     except yaml.MarkedYAMLError as error:
-        end, mark = error.problem_mark, error.context_mark or error.problem_mark
+        end = error.problem_mark
+        mark = error.context_mark or error.problem_mark
         if mark is None or end is None or end.index >= len(text.rstrip()):  # truncated
             raise
         hint = "Correct the line, or pass fx, fy, cx, cy and baseline, or K and E."
@@ -109,7 +111,8 @@ def read_storage(text: str) -> Entries:
     entries: Entries = {}
     unclear = set[str]()  # names that occur in several sections, none of them top-level
     for key, value, level in _flat(content, ""):
-        key, numbers = key.lower(), _numbers(without_sizes(value))
+        key = key.lower()
+        numbers = _numbers(without_sizes(value))
         value = value if numbers is None else numbers
         if level and key in entries and not np.array_equal(entries[key], value):
             unclear.add(key)

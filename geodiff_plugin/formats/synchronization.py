@@ -118,7 +118,8 @@ def pair_frames(left: VideoFacts, right: VideoFacts, offset_s: float) -> list[tu
     A right frame is at most half the time between two frames away. Videos of equal length that start together
     are paired frame by frame, because the times of synchronized cameras may jitter.
     """
-    times, others = np.asarray(left.times) - offset_s, np.asarray(right.times)
+    times = np.asarray(left.times) - offset_s
+    others = np.asarray(right.times)
     interval = max(frame_interval(times), frame_interval(others))
     if left.frames == right.frames and np.abs(times - others).max() < interval / 2:
         return [(n, n) for n in range(left.frames)]

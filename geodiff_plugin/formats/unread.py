@@ -196,7 +196,8 @@ def _raise_unsupported(file: Path, formats: Sequence[UnreadFormat], name: str, e
 def raise_unknown(source: Path, formats: Sequence[CaptureFormat]) -> NoReturn:
     """Raise an error for an unrecognised path: its content, the nearest format, and all formats."""
     *others, last = (each.summary for each in formats)
-    expected, all_formats = "a supported capture", f"Supported are: {', '.join(others)} and {last}."
+    expected = "a supported capture"
+    all_formats = f"Supported are: {', '.join(others)} and {last}."
     if source.is_file():
         check_file(source, "PATH", expected)  # failed downloads have a separate hint
         bad_value("PATH", expected, source, all_formats)
@@ -270,7 +271,8 @@ def _has(folder: Path, patterns: Sequence[str]) -> bool:
 
 def _nearest(folder: Path, formats: Sequence[CaptureFormat]) -> str:
     """Return the format with most of its files present, if at least half are."""
-    best, text = (MIN_FRACTION, 0), ""
+    best = (MIN_FRACTION, 0)
+    text = ""
     for each in formats:
         present = [_has(folder, patterns) for patterns in each.patterns]
         # Files are more specific than folders.
@@ -279,5 +281,6 @@ def _nearest(folder: Path, formats: Sequence[CaptureFormat]) -> str:
         if not all(present) and score > best:
             missing = [p for is_there, p in zip(present, each.patterns, strict=True) if not is_there]
             also = ", ".join(" or ".join(name.removeprefix("**/") for name in p) for p in missing)
-            best, text = score, f"The most similar format is {each.summary}, which also has {also}."
+            best = score
+            text = f"The most similar format is {each.summary}, which also has {also}."
     return text

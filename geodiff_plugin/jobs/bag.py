@@ -42,7 +42,8 @@ def depth_bag(options: DepthOptions, *, notify: Notify = silent, progress: bool 
         notify: receives messages for the user.
         progress: whether to count the pairs with a progress bar on stderr.
     """
-    out, topics = options.out or Path("depth.mcap"), options.bag_topics()
+    out = options.out or Path("depth.mcap")
+    topics = options.bag_topics()
     if out.suffix not in recordings.BAG_SUFFIXES or out.is_dir():
         expected = f"a file name ending in {' or '.join(recordings.BAG_SUFFIXES)}, because LEFT is a bag"
         bad_value("--out", expected, out)

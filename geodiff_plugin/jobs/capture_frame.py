@@ -66,14 +66,16 @@ def make_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[], A
     Raises:
         InputError: too little memory, or unreadable inputs.
     """
-    pipe, size = loaded(), capture.frame(item.key).size
+    pipe = loaded()
+    size = capture.frame(item.key).size
     with fitting_memory("A frame", size, FEWER_PROCESSES):
         return _write_frame(capture, options, pipe, item)
 
 
 def _write_frame(capture: Capture, options: CaptureOptions, pipe: Any, item: Item) -> Record:
     """Write the files and the report of one frame."""
-    name, started = item.key, time.perf_counter()
+    name = item.key
+    started = time.perf_counter()
     output = depth_of_frame(capture, pipe, name, options, options.points)
     report = _report(capture, options, item, output)
 
@@ -91,7 +93,8 @@ def _write_frame(capture: Capture, options: CaptureOptions, pipe: Any, item: Ite
 
 def _report(capture: Capture, options: CaptureOptions, item: Item, output: MetricDepthOutput) -> Record:
     """Return the report of one frame without files and seconds."""
-    solved, number = capture.solve(), capture.names.index(item.key)
+    solved = capture.solve()
+    number = capture.names.index(item.key)
     depth_m = single_map(output.prediction)
     depth_m = depth_m[depth_m > 0] if (depth_m > 0).any() else depth_m
     low, middle, high = (float(v) for v in np.percentile(depth_m, (2, 50, 98)))

@@ -31,7 +31,8 @@ def run_frames(
     capture: Capture, options: CaptureOptions, names: Sequence[str], keys: RunKeys, progress: bool
 ) -> list[Record]:
     """Process the frames that are not done yet, with one process per core; return the reports in order."""
-    path, shard = options.out / JOURNAL, Shard.of(options.shard)
+    path = options.out / JOURNAL
+    shard = Shard.of(options.shard)
     if options.overwrite:
         for each in (path, *shard_files(path).values()) if shard.whole else (shard.path(path),):
             each.unlink(missing_ok=True)

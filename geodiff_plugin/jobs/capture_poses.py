@@ -89,7 +89,8 @@ def solved_poses(
 
 def _load_or_solve(capture: Capture, options: CaptureOptions, key: str) -> SolvedCapture:
     """Load the poses of an earlier run, or solve and store them."""
-    path, shard = options.out / POSES_FILE, Shard.of(options.shard)
+    path = options.out / POSES_FILE
+    shard = Shard.of(options.shard)
     solved = None if options.overwrite and shard.whole else load_solved(path, key)
     if solved is not None:
         return solved

@@ -199,7 +199,8 @@ def pairs_to_parquet(
         InputError: all pairs fail for one reason, an unknown prior, results of other options, or a full disk.
     """
     _check_prior(options)
-    store, failures = Store.of(options), Failures(len(refs), "pair", say)
+    store = Store.of(options)
+    failures = Failures(len(refs), "pair", say)
     with connected():
         keys = store.begin(_alone(options))
         left = [ref for ref in refs if ref.name not in keys]

@@ -53,7 +53,8 @@ def finished_row(options: DepthOptions) -> Row | None:
     assert options.out is not None
     report = read_report(options.out)
     try:
-        made, row = report["arguments"], row_of(report)
+        made = report["arguments"]
+        row = row_of(report)
         # The report is written last and lists all files, so a folder that has all of them is complete.
         if not all((options.out / name).stat().st_size > 0 for name in report["files"]["names"]):
             return None

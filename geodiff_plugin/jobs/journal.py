@@ -136,7 +136,8 @@ class Journal:
     """
 
     def __init__(self, path: Path, shard: Shard = Shard()) -> None:
-        self.path, self._all = shard.path(path), path
+        self.path = shard.path(path)
+        self._all = path
         self._records: dict[tuple[str, str], Record] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -74,7 +74,8 @@ def _points_of_disparity(options: DepthOptions, path: Path, cameras: ViewCameras
         raise_input_error(
             "--disparity needs a calibrated rectified rig and cannot be used with --estimate-pose."
         )
-    size, per_px = cameras.left.size, options.points_scale
+    size = cameras.left.size
+    per_px = options.points_scale
     assert size is not None  # an image's camera has a size
     return depth_of_disparity(path, cameras.rig, size, "--disparity", per_px=per_px)
 

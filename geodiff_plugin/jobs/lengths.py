@@ -86,7 +86,8 @@ def _numbers(option: str, typed: str, form: str, count: int) -> tuple[str, list[
 
 
 def _span(capture: Capture, option: str, typed: str, name: str, numbers: Sequence[float]) -> Span:
-    frame, taken = capture.frame(name), np.array(numbers).reshape(2, 2)
+    frame = capture.frame(name)
+    taken = np.array(numbers).reshape(2, 2)
     (width, height), last = frame.size, np.array(frame.size) - 1
     if not ((taken >= 0) & (taken <= last)).all():
         bad_value(option, f"pixels within {width}x{height}", repr(typed))

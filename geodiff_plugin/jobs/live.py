@@ -71,7 +71,8 @@ def live_results(
     pair.config()  # raises if options contradict each other, before a camera is opened
     with ExitStack() as stack:
         writer = None if options.out is None else stack.enter_context(FrameWriter(options))
-        realtime, size = not options.every_frame, options.frame_size()
+        realtime = not options.every_frame
+        size = options.frame_size()
         packing = None if options.side_by_side in (None, AUTO) else Packing(options.side_by_side)
         source = CameraSource(options.source, packing, size=size, realtime=realtime)
         stack.callback(source.close)
@@ -109,7 +110,8 @@ def _result(frame: LiveFrame, min_confidence: float) -> LiveResult:
     """Summarise a frame."""
     output = frame.output
     depth_m = single_map(output.prediction * output.reliable(min_confidence)).astype(np.float32)
-    depth, matched = depth_summary(depth_m, None), output.verdict.facts[MatchedFraction]
+    depth = depth_summary(depth_m, None)
+    matched = output.verdict.facts[MatchedFraction]
     known = {
         name: depth[f"{key}_m"] for name, key in (("near_m", "min"), ("median_m", "median"), ("far_m", "max"))
     }
@@ -137,7 +139,8 @@ class FrameWriter(AbstractContextManager["FrameWriter"]):
 
     def __init__(self, options: LiveOptions) -> None:
         assert options.out is not None
-        self._folder, self._stack = check_new(options.out, options.overwrite), ExitStack()
+        self._folder = check_new(options.out, options.overwrite)
+        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         try:
@@ -185,7 +188,8 @@ class LiveMeter:
 
     def add(self, result: LiveResult) -> None:
         """Count a result that has just arrived."""
-        now, frame = time.perf_counter(), result.frame
+        now = time.perf_counter()
+        frame = result.frame
         self._started = now if self._started is None else self._started
         self._times.append(now)
         self.results, self.frames = self.results + 1, frame.number + 1

@@ -94,7 +94,8 @@ class Stages:
     ) -> None:
         self._options, self._device, self._pipe = options, device, pipe
         self._among, self._notify = among, notify
-        self._reader, self._folders = PairReader(options), dict[str, ExitStack]()
+        self._reader = PairReader(options)
+        self._folders = dict[str, ExitStack]()
         self._writers = WorkerProcesses(write_row.__module__, writers) if writers else None
         #: The stages in order.
         self.all: tuple[Stage, ...] = (
@@ -127,7 +128,8 @@ class Stages:
     def evidence(self, state: _PairState) -> _PairState:
         """Compute the evidence of the views into the pair's own store, which the guided call reads."""
         self._load_prior()
-        device, inputs = self._device_of_pipe, state.pair.inputs
+        device = self._device_of_pipe
+        inputs = state.pair.inputs
         sharing: Any = {"among": self._among, "kernels": not self._options.no_triton}
         with state.pair.log.stage("evidence"):
             prefetch_evidence(inputs.guidance, inputs.left, device, **sharing)

@@ -52,7 +52,8 @@ def find_overlays(read: Callable[[int], Sequence[np.ndarray] | None]) -> np.ndar
     ``read`` returns both views of a frame by number, ``(H, W, 3)`` in [0, 1]; ``None`` after the last, and
     an empty sequence for a damaged frame.
     """
-    samples, step = list[list[np.ndarray]](), 1
+    samples = list[list[np.ndarray]]()
+    step = 1
     for frame in range(SPAN):
         if frame % step:
             continue
@@ -62,7 +63,8 @@ def find_overlays(read: Callable[[int], Sequence[np.ndarray] | None]) -> np.ndar
             continue
         samples.append([reduced(np.rint(view.mean(-1) * 255).astype(np.uint8)) for view in views])
         if len(samples) == 2 * SAMPLES:
-            samples, step = samples[::2], 2 * step
+            samples = samples[::2]
+            step = 2 * step
     return static_pixels([left for left, _ in samples], [right for _, right in samples])
 
 

@@ -40,7 +40,8 @@ def collected_warnings(notify: Notify = say) -> Iterator[None]:
     """Report each warning of this package once, as a line; other warnings are shown as usual."""
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=UserWarning, module=r"geodiff_plugin")
-        shown_elsewhere, reported = warnings.showwarning, set[str]()
+        shown_elsewhere = warnings.showwarning
+        reported = set[str]()
 
         def collect(message: Any, category: Any, filename: str, *rest: Any, **named: Any) -> None:
             if PACKAGE_FOLDER not in Path(filename).resolve().parents:

@@ -61,7 +61,8 @@ FILES_OF_BOTH = (".mpo", ".heic", ".heif")
 #: Path fields that are images or the output folder.
 IMAGES_AND_OUT = ("left", "right", "view", "out")
 
-_PAPER, _UNPOSED = Given("preset", "paper"), Given("estimate_pose")
+_PAPER = Given("preset", "paper")
+_UNPOSED = Given("estimate_pose")
 _RIGHT, _POINTS, _DISPARITY = Given("right"), Given("points"), Given("disparity")
 _OF_SECOND_VIEW = "it applies to a second view"
 _FOR_K = "the poses are estimated. To give only K use --K, or --fx --fy --cx --cy"

@@ -139,7 +139,8 @@ def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
         if prior_map is None:
             bad_value("--prior-map", "a folder with a map for each left image, with the same name", got)
     assert options.out is not None  # always set in a run over pairs
-    calib, out = options.calib if ref.calib is None else (ref.calib,), options.out / ref.name
+    calib = options.calib if ref.calib is None else (ref.calib,)
+    out = options.out / ref.name
     mask = _mask_of(options.mask, "--mask", ref, ref.left)
     right_mask = _mask_of(options.right_mask, "--right-mask", ref, ref.right or ref.left)
     own = replace(options, left=ref.left, right=ref.right, calib=calib, out=out, prior_map=prior_map)
@@ -235,7 +236,8 @@ def _of_folders(options: DepthOptions) -> tuple[list[PairRef], Sequence[Finding]
 def _of_videos(options: DepthOptions) -> tuple[list[PairRef], Sequence[Finding]]:
     left, right = options.left, options.right
     if right is None or options.both_in_one:
-        layout, count = options.side_by_side or AUTO, video_facts(left, "LEFT").frames
+        layout = options.side_by_side or AUTO
+        count = video_facts(left, "LEFT").frames
         packing = Packing(layout)
         if layout == AUTO:
             packing = find_packing(sample_frames(left, count, LAYOUT_SAMPLES), "LEFT", left)

@@ -94,9 +94,8 @@ def prior_of_options(options: DepthOptions, device: torch.device, notify: Notify
 
 def prior_of_capture(options: CaptureOptions) -> Any:
     """Load the prior of a capture with guidance enabled."""
-    name, device = "map" if options.prior_map is not None else options.prior, pick_device(options.device)
-    pipe, graphs = (
-        load_quiet_prior(name, device, options.space, options.dtype),
-        graphs_for_many(options, device),
-    )
+    name = "map" if options.prior_map is not None else options.prior
+    device = pick_device(options.device)
+    pipe = load_quiet_prior(name, device, options.space, options.dtype)
+    graphs = graphs_for_many(options, device)
     return enable_geometry_guidance(pipe, cuda_graphs=graphs, kernels=not options.no_triton)

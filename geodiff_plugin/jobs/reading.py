@@ -189,7 +189,8 @@ def _posed_guidance(
     options: DepthOptions, views: list[np.ndarray], cameras: ViewCameras, known: KnownGeometry, masks: Masks
 ) -> GeometryGuidance:
     """Return the guidance of posed views, or of a left image alone with known depths."""
-    rig, common = cameras.rig, _common_arguments(options, known, masks)
+    rig = cameras.rig
+    common = _common_arguments(options, known, masks)
     assert rig is not None
     if len(views) == 1:
         if not options.cropped:
@@ -219,7 +220,8 @@ class PairReader:
 
     def __init__(self, options: DepthOptions) -> None:
         self._options = options
-        self._videos, self._open = dict[Path, recordings.VideoReader | recordings.BagReader](), ExitStack()
+        self._videos = dict[Path, recordings.VideoReader | recordings.BagReader]()
+        self._open = ExitStack()
         self._overlays = dict[Path, np.ndarray | None]()  # of each video or bag
 
     def __enter__(self) -> Self:

@@ -142,7 +142,8 @@ def severities(report: dict[str, Any]) -> set[str]:
 
 def build_report(run: PairRun) -> dict[str, Any]:
     """Build the report of a pair, without seconds and files, which are added last."""
-    output, guidance = run.output, run.inputs.guidance
+    output = run.output
+    guidance = run.inputs.guidance
     error = math.nan
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
@@ -183,7 +184,9 @@ def _estimated_pose(output: MetricDepthOutput, guidance: GeometryGuidance) -> di
 
 def _cameras(run: PairRun) -> dict[str, Any]:
     """Return the cameras that were used, with lengths in the output's unit."""
-    rig, output, further = run.inputs.rig, run.output, run.inputs.guidance.rigs[1:]
+    rig = run.inputs.rig
+    output = run.output
+    further = run.inputs.guidance.rigs[1:]
     return {
         "left_size": rig.size_left,
         "right_size": rig.size_right,
@@ -204,7 +207,8 @@ def _length(value: float, unit: str | None) -> str:
 
 def depth_range_words(depth: Mapping[str, Any], unit: str | None) -> str:
     """Format the range of a ``depth_summary``, such as ``3.24 m to beyond 71 m``."""
-    near, beyond_m = _length(depth["min_m"], unit), depth.get("beyond_m")
+    near = _length(depth["min_m"], unit)
+    beyond_m = depth.get("beyond_m")
     if beyond_m is None:
         return f"{near} to {_length(depth['max_m'], unit)}"
     far = f"beyond {float(f'{beyond_m:.2g}'):g}" + ("" if unit is None else f" {unit}")

@@ -102,7 +102,8 @@ def result_columns(run: PairRun) -> Row:
     """Return ``COLUMNS`` of a pair: maps as PNG, their camera, and the fields of the run's table."""
     report = build_report(run)
     report["seconds"] = run.log.seconds
-    reported, K = row_of(report), np.asarray(run.output.K)[0].astype(float)
+    reported = row_of(report)
+    K = np.asarray(run.output.K)[0].astype(float)
     depth_m = single_map(run.output.prediction)
     confidence, sigma = run.output.confidence, run.output.sigma
     named = ("near_m", "median_m", "far_m", "verdict", "codes", "seconds")

@@ -58,7 +58,8 @@ class Runner:
         progress: bool = True,
         whole: Callable[[Item, Record], bool] | None = None,
     ) -> None:
-        self.items, self.journal = list(items), journal
+        self.items = list(items)
+        self.journal = journal
         if len({(item.key, item.inputs) for item in self.items}) < len(self.items):
             bad_value("items", "unique by key", f"{len(self.items)} {noun}s, some with the same key")
         for item in self.items:
@@ -66,7 +67,8 @@ class Runner:
             if record is not None and whole is not None and not whole(item, record):
                 journal.forget(item)
         self._noun, self._is_recoverable, self._progress = noun, is_recoverable, progress
-        self._failures, self._recording = Failures(len(self.items), noun, say), Lock()
+        self._failures = Failures(len(self.items), noun, say)
+        self._recording = Lock()
 
     @property
     def left(self) -> list[Item]:
@@ -87,7 +89,8 @@ class Runner:
         Raises:
             InputError: all items failed for one reason.
         """
-        left, line = self.left, _StagePipeline(stages)
+        left = self.left
+        line = _StagePipeline(stages)
         max_items = max_items or line.threads
         begun: deque[tuple[Item, Callable[[], Record]]] = deque()
         release = release or (lambda _: None)
@@ -194,7 +197,8 @@ class _ItemQueue:
     """Queue of items shared by several threads, until it is empty or stopped."""
 
     def __init__(self, items: Sequence[Item]) -> None:
-        self._items, self._stopped = deque(items), False
+        self._items = deque(items)
+        self._stopped = False
 
     def take(self) -> Item | None:
         """Return the next item, or ``None``."""
@@ -223,7 +227,8 @@ class _StagePipeline:
 
     def __init__(self, stages: Sequence[Stage]) -> None:
         threads = [stage.threads if isinstance(stage, ParallelStage) else 1 for stage in stages]
-        self.threads, self._stages = sum(threads), stages
+        self.threads = sum(threads)
+        self._stages = stages
         self._pools = [ThreadPoolExecutor(count) for count in threads] if self.threads > 1 else []
         self._room = [
             Semaphore(count + 1) for count in threads

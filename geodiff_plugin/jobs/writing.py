@@ -78,7 +78,8 @@ def write_maps(
 
     The cloud has the points that are ``reliable`` under the thresholds.
     """
-    depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
+    depth_m = single_map(output.prediction).astype(np.float32)
+    K = np.asarray(output.K)[0]
     formats.write_depth_npy(folder / "depth.npy", depth_m)
     valid = single_map(output.valid)
     zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m * valid)
@@ -91,7 +92,8 @@ def write_maps(
         formats.write_sigma_mm(folder / "sigma_mm.png", sigma_m)
     for name, values in maps.items():
         np.save(folder / f"{name}.npy", values.astype(np.float32))
-    flying, reliable = formats.flying_points(depth_m), single_map(output.reliable(min_confidence, max_sigma))
+    flying = formats.flying_points(depth_m)
+    reliable = single_map(output.reliable(min_confidence, max_sigma))
     confidence = error = None
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
@@ -102,7 +104,8 @@ def write_maps(
         confidence = _save_figure(figure, folder / "confidence.png")
     left = in_8_bits(left)
     save_png(plotting.overview(left, depth, confidence, error), folder / "overview.png")
-    kept, cloud = _thinned(reliable & ~flying, max_points), folder / "cloud.ply"
+    kept = _thinned(reliable & ~flying, max_points)
+    cloud = folder / "cloud.ply"
     points = formats.write_ply(cloud, depth_m, left, K, valid=kept, unit=output.unit, sigma_m=sigma_m)
     return {
         "depth_mm_zero_pixels": zeros,
@@ -153,7 +156,8 @@ def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> st
 
 def cameras_of(output: MetricDepthOutput, guidance: GeometryGuidance) -> tuple[PosedCamera, ...]:
     """Return the camera of every view of one image, left one first, with the poses used by the call."""
-    depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
+    depth_m = single_map(output.prediction)
+    K = np.asarray(output.K)[0].astype(np.float64)
     further = zip(guidance.rigs, used_poses(output, guidance), guidance.rights, strict=True)
     rights = (PosedCamera(rig.K_right, (image.shape[-1], image.shape[-2]), E=E) for rig, E, image in further)
     return (PosedCamera(K, (depth_m.shape[1], depth_m.shape[0]), E=np.eye(4)), *rights)

@@ -32,8 +32,11 @@ def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor, *, fresh: bool)
     planes, count, breadth = cost.shape
     # Both directions advance together: entry 0 down, entry 1 up. The padded planes at both ends never win.
     padded = total.new_full((2, planes + 2, breadth), NEVER)
-    path, before, after = padded[:, 1:-1], padded[:, :-2], padded[:, 2:]
-    step, least = total.new_empty(2, planes, breadth), total.new_empty(2, 1, breadth)
+    path = padded[:, 1:-1]
+    before = padded[:, :-2]
+    after = padded[:, 2:]
+    step = total.new_empty(2, planes, breadth)
+    least = total.new_empty(2, 1, breadth)
     limits = torch.stack([p2[1:], p2[1:].flip(0)], dim=1)[:, :, None]
     for n in range(count):
         rows = (n, count - 1 - n)
@@ -63,7 +66,8 @@ def jump_penalties(grey: Tensor, axes: Sequence[tuple[int, int]]) -> Tensor:
     height, width = grey.shape
     for of_axis, (down, across) in zip(difference, axes, strict=True):
         # Overlapping crops: the pixels that have a previous one, and these previous ones.
-        to_right, to_left = max(across, 0), max(-across, 0)
+        to_right = max(across, 0)
+        to_left = max(-across, 0)
         here = slice(down, height), slice(to_right, width - to_left)
         previous = slice(0, height - down), slice(to_left, width - to_right)
         of_axis[here] = (grey[here] - grey[previous]).abs()
@@ -84,9 +88,11 @@ def aggregate(levels: Tensor, grey: Tensor, *, buffers: Buffers | None = None) -
     Source: Hirschmueller 2008, Eq. 13.
     """
     penalties = jump_penalties(grey, AXES)
-    vertical, horizontal = penalties[0], penalties[1].T
+    vertical = penalties[0]
+    horizontal = penalties[1].T
     planes, height, width = levels.shape
-    buffers, paths = buffers or Buffers(), levels.new_empty(0, dtype=torch.int16)
+    buffers = buffers or Buffers()
+    paths = levels.new_empty(0, dtype=torch.int16)
     transposed = buffers.empty("turned", planes, (width, height), levels)
     sideways = buffers.empty("sideways", planes, (width, height), paths)
     total = buffers.empty("total", planes, (height, width), paths)

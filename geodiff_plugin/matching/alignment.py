@@ -67,7 +67,8 @@ class AlignedView:
 
     def sources(self, count: int, axis: int) -> np.ndarray:
         """Invert ``positions``: the left line of each canvas line, ``(D, n)``, or ``count`` for none."""
-        lines, scale = np.arange(self.size[1 - axis]), self.scale[:, None]
+        lines = np.arange(self.size[1 - axis])
+        scale = self.scale[:, None]
         at = ((lines - self.shift[:, axis, None]) / np.maximum(scale, 1e-9)).round()
         seen = (scale > 0) & (at >= 0) & (at < count)
         return np.where(seen, at, count).astype(np.int64)
@@ -89,11 +90,13 @@ def align_view(right: View, left: Camera, inverse_depth: Tensor) -> AlignedView:
     the visible part of the right image, at most three left grids wide and high.
     """
     assert left.size is not None
-    image, size = right.image_01, left.size[::-1]
+    image = right.image_01
+    size = left.size[::-1]
     compared = None if right.valid is None else eroded(right.valid, MARGIN_PX)
     matrices = right.camera.K, right.T_right_from_left, left.K
     K_r, T, K = (each.astype(np.float64) for each in matrices)
-    R, w = T[:3, :3], inverse_depth.cpu().numpy().astype(np.float64)
+    R = T[:3, :3]
+    w = inverse_depth.cpu().numpy().astype(np.float64)
     centre = R.T @ T[:3, 3]
     ratio = 1.0 + w * centre[2]  # depth in the rotated view over depth in the left view
     scale = np.where(ratio > _MIN_RATIO, 1.0 / np.maximum(ratio, _MIN_RATIO), 0.0)
@@ -123,7 +126,8 @@ def _rotated(
     )
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     p = torch.stack([column, row, torch.ones_like(row)], dim=-1) @ to_device_of(row, to_right).T
-    uv, ahead = p[..., :2] / p[..., 2:].clamp_min(1e-9), p[..., 2] > 1e-9
+    uv = p[..., :2] / p[..., 2:].clamp_min(1e-9)
+    ahead = p[..., 2] > 1e-9
     last = constant_like(uv, image.shape[-1] - 1, image.shape[-2] - 1)
     valid = ahead & ((uv >= -EDGE_PX) & (uv <= last + EDGE_PX)).all(dim=-1)
     # Bicubic, because the result is interpolated again on every plane.
@@ -158,7 +162,8 @@ def _extent(
     far = np.array([size[1] - 1.0, size[0] - 1.0])
     ends = np.concatenate([shift, shift + scale[:, None] * far])[np.tile(scale > 0, 2)]
     low, high = (ends.min(0), ends.max(0)) if len(ends) else (np.zeros_like(far), far)
-    low, high = np.maximum(low, -far), np.minimum(high, 2 * far)
+    low = np.maximum(low, -far)
+    high = np.minimum(high, 2 * far)
     steps = np.linspace(0, 1, 9)
     u, v = np.meshgrid(steps * (size_right[1] - 1), steps * (size_right[0] - 1))
     grid = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1)
@@ -176,7 +181,8 @@ def _resampled(grey: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         last = grey.shape[axis] - 1
         positions = positions.clamp(0, last)
         first = positions.floor()
-        at, weight = first.int(), positions - first
+        at = first.int()
+        weight = positions - first
         weight = weight[:, None] if axis == 0 else weight
         grey = torch.lerp(
             grey.index_select(axis, at), grey.index_select(axis, (at + 1).clamp_(max=last)), weight
@@ -263,7 +269,8 @@ class ComparedView:
         if self._shifts is None:
             levels = _resampled(self._view.grey, self._rows[plane], self._columns[plane])
             return census_cost(census(levels, self._work), self._left, self._work)
-        described, begin = self._phase(self._shifts.phase(plane), self._shifts), self._shifts.begin(plane)
+        described = self._phase(self._shifts.phase(plane), self._shifts)
+        begin = self._shifts.begin(plane)
         return census_cost(described[:, :, begin : begin + self._left.shape[2]], self._left, self._work)
 
     def seen(self, plane: int) -> Tensor:

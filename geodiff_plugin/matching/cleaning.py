@@ -192,7 +192,8 @@ def clean(images: Sequence[Tensor], grid_pixels: int) -> list[Tensor]:
     the matching grid, are returned unchanged. Images of one size are analysed together.
     """
     cleaned = list(images)
-    most, by_shape = _MAX_PIXEL_RATIO * grid_pixels, defaultdict[torch.Size, list[int]](list)
+    most = _MAX_PIXEL_RATIO * grid_pixels
+    by_shape = defaultdict[torch.Size, list[int]](list)
     for number, image in enumerate(images):
         if image.shape[-2] * image.shape[-1] <= most:
             by_shape[image.shape].append(number)

@@ -42,7 +42,8 @@ def _right_winners(volume: CostVolume, view: AlignedView, buffers: Buffers) -> T
     The sweep's costs are looked up for each pixel of the right view and aggregated along its edges.
     """
     height, width = volume.size
-    rows, columns = view.sources(height, 1)[:, ::EVERY_ROW], view.sources(width, 0)
+    rows = view.sources(height, 1)[:, ::EVERY_ROW]
+    columns = view.sources(width, 0)
     levels = _look_up(volume.levels, rows, columns, buffers)
     return winner_positions(aggregate(levels, view.guide[::EVERY_ROW], buffers=buffers))
 
@@ -73,7 +74,8 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
     at_scale = torch.lerp(scale[below], scale[below + 1], part)
     height, width = position.shape
     lines = (torch.arange(width, device=device), torch.arange(height, device=device)[:, None])
-    places, inside = [], at_scale > 0
+    places = []
+    inside = at_scale > 0
     for axis, line in enumerate(lines):
         at = (at_scale * line + torch.lerp(shift[below, axis], shift[below + 1, axis], part)).round()
         last = view.size[1 - axis] - 1
@@ -83,7 +85,8 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
     if view.valid is not None:
         inside = inside & view.valid[row, column]
     # Use the mean of the two neighbouring matched rows; at an edge it agrees with neither.
-    before, after = row // EVERY_ROW, ((row + EVERY_ROW - 1) // EVERY_ROW).clamp_max(len(other) - 1)
+    before = row // EVERY_ROW
+    after = ((row + EVERY_ROW - 1) // EVERY_ROW).clamp_max(len(other) - 1)
     difference = (0.5 * (other[before, column] + other[after, column]) - position).abs()
     return torch.where(inside, difference, torch.full_like(difference, torch.inf))
 

@@ -34,7 +34,8 @@ class Gaps(NamedTuple):
 
     def ends(self, values: np.ndarray, outside: float) -> tuple[np.ndarray, np.ndarray]:
         """Return ``values (H, W)`` left and right of each gap; ``outside`` beyond the ends of its row."""
-        width, flat = self.unknown.shape[1], values.ravel()
+        width = self.unknown.shape[1]
+        flat = values.ravel()
         of_row = self.row * width
         left = flat[of_row + np.maximum(self.first - 1, 0)]
         right = flat[of_row + np.minimum(self.end, width - 1)]
@@ -79,7 +80,8 @@ def occluded_gaps(shift: np.ndarray, gaps: Gaps, infinity_px: float) -> np.ndarr
         infinity_px: disparity of a point at infinity, from which shifts are counted.
     """
     left, right = gaps.ends(shift, np.nan)
-    step, in_view = right - left, gaps.first >= right + infinity_px
+    step = right - left
+    in_view = gaps.first >= right + infinity_px
     return in_view & (step > MIN_STEP_PX) & (gaps.width <= step + SLACK_PX)
 
 

@@ -44,7 +44,8 @@ class Parallax:
         infinity = infinity[:, infinity[2] > NEAREST_M]
         centre = K_r @ T[:3, 3:]  # projection of the left camera, towards which pixels move
         # On a plane of inverse depth w the shift is w * way / (far + w * ahead).
-        self._far, self._ahead = infinity[2], float(centre[2, 0])
+        self._far = infinity[2]
+        self._ahead = float(centre[2, 0])
         self._distance = np.hypot(*(centre[:2] - infinity[:2] / infinity[2] * self._ahead))
         self._name = name
 

@@ -135,7 +135,8 @@ def first_rectified_pair(native: PosedViews) -> RowImages | None:
 
     ``native`` has the image and its right views at native size.
     """
-    left, size = native.left, grid_of_rows(native.size)
+    left = native.left
+    size = grid_of_rows(native.size)
     for right in native.rights:
         if right.size == native.size and is_rectified(left.camera, right.camera, right.T_right_from_left):
             return row_images(left.resized(size), right.resized(size))
@@ -144,8 +145,11 @@ def first_rectified_pair(native: PosedViews) -> RowImages | None:
 
 def row_images(left: View, right: View) -> RowImages:
     """Convert a rectified pair of one size for row matching, with the right view on either side."""
-    K, K_right, T = left.camera.K, right.camera.K, right.T_right_from_left
-    infinity, mirrored = float(K[0, 2] - K_right[0, 2]), bool(T[0, 3] > 0)
+    K = left.camera.K
+    K_right = right.camera.K
+    T = right.T_right_from_left
+    infinity = float(K[0, 2] - K_right[0, 2])
+    mirrored = bool(T[0, 3] > 0)
     levels = grey(torch.stack([left.image_01, right.image_01]))[:, 0] * 255.0
     infinity = -infinity if mirrored else infinity
     return RowImages(levels.round().byte(), infinity, float(K[0, 0]), T[0, 3], _valid_of(left, right))

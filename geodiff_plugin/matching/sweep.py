@@ -30,7 +30,8 @@ def sweep_planes(
     one, so that it needs no more memory than the result: two bytes per pixel and plane. ``parallax`` is
     ``parallax_of`` for these views, if already known.
     """
-    planes, camera = inverse_depth.cpu(), posed.left.camera
+    planes = inverse_depth.cpu()
+    camera = posed.left.camera
     aligned = tuple(align_view(view, camera, planes) for view in posed.rights)
     left = grey_levels(F.pad(posed.left.image_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0])
     levels, in_view = _sweep(left, aligned)
@@ -48,7 +49,8 @@ def _sweep(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:
     """Compute ``CostVolume.levels`` and ``in_view`` from the left view's ``grey_levels`` with a margin."""
     described = census(left)
     compared = [ComparedView(described, view) for view in views]
-    count, size = len(views[0].scale), image_size(described)
+    count = len(views[0].scale)
+    size = image_size(described)
     levels = empty_volume(count, size, torch.uint8, left.device)
     in_view = left.new_empty(levels.shape, dtype=torch.bool)
     unseen = levels.new_full((), UNSEEN_LEVEL)

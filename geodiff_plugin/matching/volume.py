@@ -72,7 +72,8 @@ class Buffers:
 
     def empty(self, name: str, planes: int, size: tuple[int, int], like: Tensor) -> Tensor:
         """Return ``empty_volume`` in the buffer of this name, whose previous content is lost."""
-        count, held = planes * size[0] * size[1], self._held.get(name)
+        count = planes * size[0] * size[1]
+        held = self._held.get(name)
         if held is None or held.numel() < count:
             held = self._held[name] = torch.empty(count, dtype=like.dtype, device=like.device)
         return held[:count].view(size[0], planes, size[1]).transpose(0, 1)

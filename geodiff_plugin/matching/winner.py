@@ -47,7 +47,8 @@ def winner(total: Tensor, levels: Tensor, in_view: Tensor) -> Winner:
     sums = total.gather(0, around).float()
     second_best = total.scatter_(0, around, NEVER).amin(dim=0).float()
     position = _position(index, sums, len(total) - 1)
-    gain, sharpness = _gain(index, levels, in_view), _sharpness(index, levels)
+    gain = _gain(index, levels, in_view)
+    sharpness = _sharpness(index, levels)
     return Winner(position, sums[1], second_best, gain, sharpness)
 
 

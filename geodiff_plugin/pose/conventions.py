@@ -69,7 +69,8 @@ def residuals_px(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> list
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         F = np.linalg.inv(K[j]).T @ cross @ T[:3, :3] @ np.linalg.inv(K[i])
         a, b = (np.c_[px[::step], np.ones(len(px[::step]))] for px in (px_i, px_j))
-        Fa, Fb = a @ F.T, b @ F
+        Fa = a @ F.T
+        Fb = b @ F
         below = np.sqrt((Fa[:, :2] ** 2).sum(1) + (Fb[:, :2] ** 2).sum(1))
         distances.append(np.abs((b * Fa).sum(1)) / np.maximum(below, 1e-12))
     return distances

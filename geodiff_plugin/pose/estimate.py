@@ -95,7 +95,8 @@ class EstimatedPose:
 
 def _parallax_deg(tracks: Tracks, R: np.ndarray) -> np.ndarray:
     """Compute the angles ``(N,)``, degrees, between both rays of a view's tracks, for its ``R (3, 3)``."""
-    left, right = tracks.rays @ R.T, tracks.right_rays(0)
+    left = tracks.rays @ R.T
+    right = tracks.right_rays(0)
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(left, right), axis=1), (left * right).sum(1)))
 
 
@@ -107,7 +108,8 @@ class Inliers:
     fraction: float = MIN_INLIER_FRACTION
 
 
-OF_SIFT, OF_XFEAT = Inliers(), Inliers(MIN_LEARNED_INLIERS, MIN_LEARNED_FRACTION)
+OF_SIFT = Inliers()
+OF_XFEAT = Inliers(MIN_LEARNED_INLIERS, MIN_LEARNED_FRACTION)
 
 
 def estimate_pose(tracks: Tracks, name: str = "the two images", needed: Inliers = OF_SIFT) -> EstimatedPose:
@@ -171,7 +173,8 @@ def estimate_poses(
 
 def _poses_of_tracks(tracks: Tracks, needed: Inliers) -> tuple[Tracks, list[EstimatedPose]]:
     """Estimate the poses of all right images; returns inliers and poses."""
-    poses, count = [], len(tracks.seen)
+    poses = []
+    count = len(tracks.seen)
     for v in range(count):
         name = "the two images" if count == 1 else f"the left and right image {v + 1}"
         poses.append(estimate_pose(tracks.view(v), name, needed))
@@ -363,7 +366,8 @@ def find_scale(
     fits = (np.nan_to_num(residuals_px(tracks, Ts), nan=0.0) < 1.5).all(0)
     tracks = tracks.kept(fits)
     inverse_depth = solve_inverse_depth(tracks, Ts)
-    tracks, inverse_depth = tracks.kept(inverse_depth > 0), inverse_depth[inverse_depth > 0]
+    tracks = tracks.kept(inverse_depth > 0)
+    inverse_depth = inverse_depth[inverse_depth > 0]
     if known_length is not None:
         *ends, metres = known_length
         check_number(metres, "known length", 1e-6, 1e6)

@@ -246,7 +246,8 @@ def _rescale(
 
 def _align(result: SolvedCapture, E_given: np.ndarray, scale: float) -> SolvedCapture:
     """Scale the capture, and rotate and shift it to the given poses ``(N, 4, 4)``."""
-    centres, given = result.E[:, :3, 3], E_given[:, :3, 3]
+    centres = result.E[:, :3, 3]
+    given = E_given[:, :3, 3]
     # Viewing directions count three times as much as positions: positions on a line leave a rotation
     # undetermined.
     radius = 3.0 * float(np.median(np.linalg.norm(given - np.median(given, axis=0), axis=1)))
@@ -319,8 +320,10 @@ def _result(
 ) -> SolvedCapture:
     """Extract the capture from a model, in its world frame."""
     by_number = dict(model.points3D.items())  # every access of the property copies all points
-    E, numbers = base.poses(model), sorted(by_number)
-    rows, seen = {number: row for row, number in enumerate(numbers)}, []
+    E = base.poses(model)
+    numbers = sorted(by_number)
+    rows = {number: row for row, number in enumerate(numbers)}
+    seen = []
     for i in range(len(base)):
         image = model.image(i + 1) if model.exists_image(i + 1) else None
         pairs = [(p.xy, rows[p.point3D_id]) for p in image.points2D if p.has_point3D()] if image else []
@@ -341,7 +344,8 @@ def _result(
 
 def _with_findings(result: SolvedCapture, findings: list[Finding], names: Sequence[str]) -> SolvedCapture:
     """Add findings about the scale and about unconnected frames to the capture."""
-    ratio, spread = result.scale_trajectory / result.scale_depth, result.scale_rel_std
+    ratio = result.scale_trajectory / result.scale_depth
+    spread = result.scale_rel_std
     if abs(math.log(ratio)) > MAX_LOG_RATIO:
         sentence = (
             "The scales from the given positions and from the scene depth under the given poses differ by "
@@ -352,7 +356,8 @@ def _with_findings(result: SolvedCapture, findings: list[Finding], names: Sequen
         sentence = f"The scale is uncertain by {100 * spread:.0f} %. Pass --known-length for an exact one."
         findings.append(Finding("capture.scale", sentence))
     if result.status == "solved" and result.E_given is not None:
-        moved, size = result.moved()[0], np.linalg.norm(np.ptp(result.E_given[:, :3, 3], axis=0))
+        moved = result.moved()[0]
+        size = np.linalg.norm(np.ptp(result.E_given[:, :3, 3], axis=0))
         least = max(FAR_TIMES * float(np.nanmedian(moved)), FAR_FRACTION * float(size))
         far = result.connected & (moved > least)  # the others keep their poses
         if wrong := [name for name, is_far in zip(names, far, strict=True) if is_far]:

@@ -60,7 +60,8 @@ def static_features(px: Sequence[np.ndarray], descriptors: Sequence[np.ndarray])
         px: ``(n, 2)`` pixels of the features of each frame, all frames of one size.
         descriptors: ``(n, D)`` of any type and length.
     """
-    chosen, nothing = sampled_frames(len(px), MAX_FRAMES), np.zeros((0, 2))
+    chosen = sampled_frames(len(px), MAX_FRAMES)
+    nothing = np.zeros((0, 2))
     if len(px) < MIN_FRAMES:
         return nothing
     places = np.concatenate([px[i] for i in chosen]).astype(np.float64)
@@ -153,7 +154,9 @@ def _gradients(grey: np.ndarray) -> np.ndarray:
 def _same(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, float]:
     """Return where two gradients ``(2, H, W)`` and their windows are similar, and the fraction of ``one``."""
     lengths = [np.sqrt((each**2).sum(0)) for each in (one, other)]
-    product, low, high = lengths[0] * lengths[1], np.minimum(*lengths), np.maximum(*lengths)
+    product = lengths[0] * lengths[1]
+    low = np.minimum(*lengths)
+    high = np.maximum(*lengths)
     same = ((one * other).sum(0) > MIN_GRADIENT_COSINE * product) & (high < MAX_GRADIENT_RATIO * low)
     weight = lengths[0] ** 2
     alike, total = (cv2.blur(each, (2 * WINDOW + 1,) * 2) for each in (weight * same, weight))

@@ -63,8 +63,11 @@ class Reconstruction:
     """
 
     def __init__(self, work: Path, cameras: Sequence[Camera], threads: int) -> None:
-        self._work, self._path, self._threads = work, work / "features.db", threads
-        self._given, self._downscaled = list(cameras), [_downscaled(camera) for camera in cameras]
+        self._work = work
+        self._path = work / "features.db"
+        self._threads = threads
+        self._given = list(cameras)
+        self._downscaled = [_downscaled(camera) for camera in cameras]
         self.K_given = np.stack([camera.K for camera in cameras])
         different = [(camera.size, *np.round(camera.K, 6).ravel()) for camera in cameras]
         kinds = {camera: number for number, camera in enumerate(dict.fromkeys(different), 1)}
@@ -117,7 +120,8 @@ class Reconstruction:
         names = self._path.with_suffix(".pairs.txt")
         names.write_text("\n".join(f"{_name(i)} {_name(j)}" for i, j in pairs), encoding="utf-8")
         matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
-        matching.num_threads, matching.use_gpu = self._threads, False
+        matching.num_threads = self._threads
+        matching.use_gpu = False
         pairing.match_list_path = str(names)
         verification = colmap.TwoViewGeometryOptions()
         verification.ransac.random_seed, verification.min_num_inliers = 0, MIN_INLIERS
@@ -145,7 +149,9 @@ class Reconstruction:
 
     def _options(self) -> Any:
         options = pycolmap().IncrementalPipelineOptions()
-        options.num_threads, options.extract_colors, options.random_seed = self._threads, False, 0
+        options.num_threads = self._threads
+        options.extract_colors = False
+        options.random_seed = 0
         options.mapper.random_seed = options.triangulation.random_seed = 0
         return options
 
@@ -160,7 +166,8 @@ class Reconstruction:
         angle_deg = max(0.3, math.degrees(error_px / focal))
         rules.create_max_angle_error = rules.continue_max_angle_error = angle_deg
         rules.min_angle = 1.0
-        work, out = str(self._work), self._work / "model"
+        work = str(self._work)
+        out = self._work / "model"
         out.mkdir(exist_ok=True)
         return pycolmap().triangulate_points(model, self._path, work, str(out), True, options, False)
 
@@ -171,9 +178,12 @@ class Reconstruction:
         options.print_summary = options.refine_extra_params = options.refine_principal_point = False
         options.refine_focal_length = focal
         ceres = options.ceres
-        ceres.loss_function_type, ceres.loss_function_scale = colmap.LossFunctionType.CAUCHY, loss_px
+        ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+        ceres.loss_function_scale = loss_px
         solver = ceres.solver_options
-        solver.num_threads, solver.max_num_iterations, solver.function_tolerance = self._threads, 30, 1e-5
+        solver.num_threads = self._threads
+        solver.max_num_iterations = 30
+        solver.function_tolerance = 1e-5
         config = colmap.BundleAdjustmentConfig()
         for image in model.reg_image_ids():
             config.add_image(image)
@@ -195,7 +205,8 @@ class Reconstruction:
     def from_nothing(self) -> list[Any]:
         """Run incremental structure from motion and return its models, the largest first."""
         options = self._options()
-        options.min_model_size, options.ba_refine_focal_length = 3, len(self) >= MIN_FRAMES_FOR_FOCAL
+        options.min_model_size = 3
+        options.ba_refine_focal_length = len(self) >= MIN_FRAMES_FOR_FOCAL
         models = pycolmap().incremental_mapping(self._path, str(self._work), str(self._work), options)
         return sorted(models.values(), key=lambda model: -model.num_reg_images())
 

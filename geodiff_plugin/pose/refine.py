@@ -101,7 +101,10 @@ def refine_views(
     they fit, if a common error explains the misfit (``mistaken``), or if no nearby pose is better. A
     rectified rig is refined only if the dense matches do not fit it either.
     """
-    rights, sparse, given, before = posed.rights, fit.tracks, fit.greys.given, fit.residual_px
+    rights = posed.rights
+    sparse = fit.tracks
+    given = fit.greys.given
+    before = fit.residual_px
     report = _with_residuals(_as_given(posed, fit, measured), sparse, before)
     if mistaken:
         return CheckedViews(rights, replace(report, status="mistaken"))
@@ -121,7 +124,8 @@ def refine_views(
 
 def _with_residuals(report: PoseReport, tracks: Tracks, residual_px: np.ndarray) -> PoseReport:
     """Add the residuals ``(V,)`` of tracks under the given poses, which are in use, to the report."""
-    residuals, matches = tuple(residual_px.tolist()), tuple(map(float, tracks.seen.sum(1)))
+    residuals = tuple(residual_px.tolist())
+    matches = tuple(map(float, tracks.seen.sum(1)))
     return replace(report, residual_px_given=residuals, residual_px=residuals, matches=matches)
 
 
@@ -138,7 +142,9 @@ def refine_by_flow(posed: PosedViews, fit: PoseFit, measured: bool) -> CheckedVi
     not fit is therefore wrong, but a pose refined by it is not certain. This evidence is too weak to change a
     calibration.
     """
-    rights, given, sparse = posed.rights, fit.greys.given, fit.tracks
+    rights = posed.rights
+    given = fit.greys.given
+    sparse = fit.tracks
     left, *greys = [view.grey for view in fit.greys.views]
     tracks = sparse
     with suppress(InputError):  # views without overlap; matching raises their error
@@ -230,7 +236,8 @@ def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tupl
     ratios = np.log(refined[ahead] / given[ahead])
     by_depth = float(np.median(ratios))
     uneven = float(np.median(np.abs(ratios - by_depth)))
-    of_length, of_depth = LENGTH_SPREAD**2, DEPTH_SPREAD**2 + misfit**2 + uneven**2
+    of_length = LENGTH_SPREAD**2
+    of_depth = DEPTH_SPREAD**2 + misfit**2 + uneven**2
     weight = of_length / (of_length + of_depth)
     # Variance of the weighted mean, plus the disagreement of the two lengths.
     variance = weight * of_depth + weight * (1.0 - weight) * by_depth**2
@@ -241,7 +248,8 @@ def _rescaled(
     tracks: Tracks, given: np.ndarray, Ts: np.ndarray, before: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Scale a tracker's refined poses by baselines and scene depth; also returns the spread of the scale."""
-    refined, shifts = solve_inverse_depth(tracks, Ts), []
+    refined = solve_inverse_depth(tracks, Ts)
+    shifts = []
     depths = refined, np.zeros_like(refined)
     for seen, K, T in zip(tracks.seen, tracks.K_rights, Ts, strict=True):
         here, far = (project_tracks(tracks.rays[seen], w[seen], K, T).px for w in depths)
@@ -307,7 +315,8 @@ def fit_displacement(tracks: Tracks, T: np.ndarray, size: tuple[int, int]) -> Di
         return None
     coefficients = _fit_cubic(basis, normals, off)
     lengths = np.linalg.norm(basis @ coefficients, axis=1)
-    max_px, rms_px = float(np.quantile(lengths, 0.98)), float(np.sqrt((lengths**2).mean()))
+    max_px = float(np.quantile(lengths, 0.98))
+    rms_px = float(np.sqrt((lengths**2).mean()))
     return Displacement(coefficients, size, max_px, rms_px)
 
 

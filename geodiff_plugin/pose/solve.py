@@ -133,7 +133,8 @@ def _whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> _Whitened:
         by_pose[:, v, :, 6 * v : 6 * v + 6] = _jacobian(at, w) * root[..., None]
         by_depth[:, v] = at.by_inverse_depth * root
     r = (offs * np.sqrt(weights)[..., None]).transpose(1, 0, 2).reshape(len(tracks), -1)
-    J, j = by_pose.reshape(len(tracks), 2 * views, -1), by_depth.reshape(len(tracks), -1)
+    J = by_pose.reshape(len(tracks), 2 * views, -1)
+    j = by_depth.reshape(len(tracks), -1)
     cost = np.log1p((offs**2).sum(-1) / scale_px**2)[tracks.seen].sum()
     slopes = np.maximum(np.linalg.norm(j, axis=1), 1e-12)
     along = j / slopes[:, None]
@@ -160,7 +161,9 @@ def _prior_terms(
     the last three are divided by their standard deviations in ``prior``.
     """
     size = 6 * len(Ts)
-    cost, gradient, normal = 0.0, np.zeros(size), np.zeros((size, size))
+    cost = 0.0
+    gradient = np.zeros(size)
+    normal = np.zeros((size, size))
     for v, (T, T_given) in enumerate(zip(Ts, given, strict=True)):
         at, before = (project_tracks(tracks.rays, w, tracks.K_rights[v], P) for P in (T, T_given))
         seen = tracks.seen[v]
@@ -204,16 +207,19 @@ def solve_poses(
     w_start = np.clip(solve_inverse_depth(tracks, Ts), 0.0, None)
 
     def terms(at: np.ndarray) -> _Terms:
-        data, prior_terms = _whitened(tracks, at, scale_px), _prior_terms(tracks, at, given, w_start, prior)
+        data = _whitened(tracks, at, scale_px)
+        prior_terms = _prior_terms(tracks, at, given, w_start, prior)
         J = data.left_by_pose  # with the inverse depths eliminated
-        gradient, normal = np.einsum("nkp,nk->p", J, data.residuals), np.einsum("nkp,nkq->pq", J, J)
+        gradient = np.einsum("nkp,nk->p", J, data.residuals)
+        normal = np.einsum("nkp,nkq->pq", J, J)
         return _Terms(
             trust * data.cost + prior_terms.cost,
             trust * gradient + prior_terms.gradient,
             trust * normal + prior_terms.normal,
         )
 
-    damping, now = 1e-3, terms(Ts)
+    damping = 1e-3
+    now = terms(Ts)
     for _ in range(_STEPS):
         damped = now.normal + damping * np.diag(np.diag(now.normal))
         step = np.linalg.solve(damped, -now.gradient)
@@ -223,7 +229,9 @@ def solve_poses(
             damping *= 8.0
             continue
         converged = now.cost - new.cost < 1e-6 * max(now.cost, 1.0)
-        Ts, now, damping = tried, new, damping * 0.2
+        Ts = tried
+        now = new
+        damping = damping * 0.2
         if converged:
             break
     return Ts
@@ -232,7 +240,8 @@ def solve_poses(
 def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Fit poses to the sparse matches, first with a large scale, so that no match is an outlier yet."""
     before = np.nan_to_num(before, nan=1.0)
-    prior, Ts = PosePrior(1.5 * before + _FLOOR_PX), given
+    prior = PosePrior(1.5 * before + _FLOOR_PX)
+    Ts = given
     for scale in (max(float(before.max()), 1.0), 1.0):
         Ts = solve_poses(sparse, given, prior, start=Ts, scale_px=scale)
     return Ts

@@ -110,7 +110,9 @@ class Tracks:
 
     def kept(self, mask: np.ndarray | slice) -> Tracks:
         """Select tracks by a boolean mask or an index."""
-        left_px, right_px, seen = self.left_px[mask], self.right_px[:, mask], self.seen[:, mask]
+        left_px = self.left_px[mask]
+        right_px = self.right_px[:, mask]
+        seen = self.seen[:, mask]
         return replace(self, left_px=left_px, right_px=right_px, seen=seen)
 
     def alone(self, v: int) -> Tracks:
@@ -185,7 +187,8 @@ def epipolar(tracks: Tracks, T: np.ndarray) -> Epipolar:
         tracks: tracks of one right view; values of tracks that it does not see are undefined.
         T: ``(4, 4)`` ``T_right_from_left``.
     """
-    A, b = tracks.K_rights[0] @ T[:3, :3], tracks.K_rights[0] @ T[:3, 3]
+    A = tracks.K_rights[0] @ T[:3, :3]
+    b = tracks.K_rights[0] @ T[:3, 3]
     across_b = np.array([[0.0, b[2], -b[1]], [-b[2], 0.0, b[0]]])  # rows of a x b, the normal of the line
     ax, ay, az, nx, ny = np.concatenate([A, across_b @ A]) @ tracks.rays.T
     length = np.maximum(np.hypot(nx, ny), TINY)
@@ -201,7 +204,8 @@ def _linear_inverse_depth(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
     """Compute the inverse depth with the least algebraic error, ``(N,)``."""
     above, below = np.zeros(len(tracks)), np.zeros(len(tracks))
     for right_px, seen, K, T in zip(tracks.right_px, tracks.seen, tracks.K_rights, Ts, strict=True):
-        A, b = tracks.rays @ (K @ T[:3, :3]).T, K @ T[:3, 3]
+        A = tracks.rays @ (K @ T[:3, :3]).T
+        b = K @ T[:3, 3]
         c = A[:, :2] - right_px * A[:, 2:]
         d = b[:2] - right_px * b[2]
         above -= np.where(seen, (c * d).sum(1), 0.0)
@@ -220,7 +224,8 @@ def solve_inverse_depth(tracks: Tracks, Ts: np.ndarray, weights: np.ndarray | No
     weights = tracks.seen.astype(float) if weights is None else weights * tracks.seen
     inverse_depth = _linear_inverse_depth(tracks, Ts)
     for _ in range(3):
-        above, below = np.zeros(len(tracks)), np.full(len(tracks), TINY)
+        above = np.zeros(len(tracks))
+        below = np.full(len(tracks), TINY)
         for v, T in enumerate(Ts):
             at = project_tracks(tracks.rays, inverse_depth, tracks.K_rights[v], T)
             off = tracks.right_px[v] - at.px
@@ -303,7 +308,8 @@ def grey_image(image_01: Tensor, camera: Camera, factor: float, valid: Tensor | 
     camera = Camera(camera.K.astype(np.float64), (grey.shape[1], grey.shape[0]))
     if factor < 1.0:
         size = scaled_size((grey.shape[0], grey.shape[1]), factor, factor)[::-1]
-        grey, camera = cv2.resize(grey, size, interpolation=cv2.INTER_AREA), camera.resized(size)
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        camera = camera.resized(size)
     grey = cv2.convertScaleAbs(grey, alpha=255.0)
     if valid is None:
         return GreyImage(grey, camera)
@@ -487,7 +493,8 @@ def _dense_matches(
 
 def _local_variance(grey: np.ndarray) -> np.ndarray:
     """Compute the variance of grey levels in a window of one cell around each pixel."""
-    values, window = grey.astype(np.float32), (_CELL_PX + 1,) * 2
+    values = grey.astype(np.float32)
+    window = (_CELL_PX + 1,) * 2
     return cv2.blur(values**2, window) - cv2.blur(values, window) ** 2
 
 

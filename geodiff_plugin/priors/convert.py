@@ -222,7 +222,8 @@ def unet_config(hparams: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _write_depthfm(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
-    state, config = checkpoint["state_dict"], unet_config(checkpoint["ldm_hparams"])
+    state = checkpoint["state_dict"]
+    config = unet_config(checkpoint["ldm_hparams"])
     unet = UNet2DConditionModel(**config)
     wanted = unet.state_dict().keys()
     converted = convert_ldm_unet_checkpoint({LDM_PREFIX + k: v for k, v in state.items()}, config)
@@ -238,7 +239,8 @@ def _write_depthfm(checkpoint: Mapping[str, Any], folder: Path, part: str | None
         vae = AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
     embedding = torch.as_tensor(checkpoint["empty_text_embedding"])
     prompt = _fixed_prompt(embedding.reshape(1, *embedding.shape[-2:]))
-    noising_step, scheduler = int(checkpoint["noising_step"]), FlowMatchEulerDiscreteScheduler()
+    noising_step = int(checkpoint["noising_step"])
+    scheduler = FlowMatchEulerDiscreteScheduler()
     DepthFMPipeline(unet, vae, scheduler, prompt, noising_step=noising_step).save_pretrained(folder)
     _write_card(
         folder,
@@ -286,7 +288,8 @@ def _load_transformer(state: Mapping[str, Tensor]) -> PixelDiT:
 
 
 def _write_ppd(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
-    dit, encoder = _load_transformer(_part(checkpoint, TRANSFORMER)), _load_encoder(part)
+    dit = _load_transformer(_part(checkpoint, TRANSFORMER))
+    encoder = _load_encoder(part)
     if encoder.config.hidden_size != dit.config.semantic_size:
         expected = f"{dit.config.semantic_size} wide, like the checkpoint's tokens"
         got = f"{encoder.config.hidden_size} wide, another size of Depth Anything V2"
@@ -348,7 +351,8 @@ class Trained:
 
 def _trained(state: Mapping[str, Tensor], part: str) -> Trained:
     """Return the trained weights of a component, whose names in the checkpoint start with ``part``."""
-    replaced, factors = dict[str, Tensor](), dict[str, dict[str, Tensor]]()
+    replaced = dict[str, Tensor]()
+    factors = dict[str, dict[str, Tensor]]()
     for name, value in _part(state, f"{part}.").items():
         name = name.replace(BASE_LAYER, ".")
         if found := LORA.search(name):
@@ -371,7 +375,8 @@ def _base_files(base: Path, name: str) -> tuple[list[Path], dict[str, tuple[int,
     names = {path.name for path in folder.glob("*.safetensors")}
     if (folder / INDEX).is_file():
         names = set(json.loads((folder / INDEX).read_text("utf-8"))["weight_map"].values())
-    files, shapes = [folder / file for file in sorted(names)], dict[str, tuple[int, ...]]()
+    files = [folder / file for file in sorted(names)]
+    shapes = dict[str, tuple[int, ...]]()
     if not files or not all(file.is_file() for file in files):
         got = f"a folder without some of {', '.join(sorted(names)) or 'them'}"
         bad_value("BASE", f"a folder with safetensors in {folder}", got, "Download it again.")
@@ -458,7 +463,8 @@ def _convert_marigold_v2(
     if not os.path.isfile(file) or file.suffix != ".safetensors":
         expected = f"a folder of huawei-bayerlab/marigold-v2-0 with {TRAINABLES}, such as depth/Log-stage2"
         bad_value("CHECKPOINT", expected, checkpoint, "Check the path.")
-    prompt, trained_as = _read_prompt(file, prompts), file.resolve().parent.name
+    prompt = _read_prompt(file, prompts)
+    trained_as = file.resolve().parent.name
     space = space or SPACE_OF_CHECKPOINT.get(trained_as.split("-")[0].lower())
     if space is None:
         hint = "Keep the authors' folder name, or pass the space of its map with --space."

@@ -138,9 +138,11 @@ def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | 
         bad_value("prior", "'bundled', a folder or a hub id", f"the file {name}", hint)
     if name.count("/") > 1 or name.startswith((".", "/", "~")):
         bad_value("prior", "'bundled', an existing folder, or a hub id", repr(name), "Check the path.")
-    patterns, ignored = list(SMALL_FILES), None
+    patterns = list(SMALL_FILES)
+    ignored = None
     if weights and variant is None:
-        patterns, ignored = patterns + WEIGHTS, OTHER_VARIANTS
+        patterns = patterns + WEIGHTS
+        ignored = OTHER_VARIANTS
     elif weights:
         patterns += [f"*.{variant}.safetensors", f"*.{variant}-*.safetensors"]
     expected = "'bundled', a folder, or a hub id that is cached or reachable"

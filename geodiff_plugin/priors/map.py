@@ -97,7 +97,8 @@ class DepthMapPipeline(DirectMapPipeline):
         maps = _as_list(depth_map)
         if len(maps) != len(image):
             bad_value("depth_map", f"one map (h, w) for each of {len(image)} images", f"{len(maps)}")
-        size, prepared = image_size(image), []
+        size = image_size(image)
+        prepared = []
         for values, view in zip(maps, image.float().split(1), strict=True):
             sides = values.shape[-1] / values.shape[-2], size[1] / size[0]
             if math.log(sides[0]) * math.log(sides[1]) < MIN_LOG_PRODUCT:
@@ -151,7 +152,8 @@ def _filled(values: Tensor) -> tuple[Tensor, Tensor]:
     values = torch.where(known, (values - low) / (high - low), torch.zeros_like(values))
     if bool(known.all()):
         return values, known
-    weight, affinities = KNOWN_WEIGHT * known.float(), torch.ones_like(values)
+    weight = KNOWN_WEIGHT * known.float()
+    affinities = torch.ones_like(values)
     system = FieldSystem(weight, weight * values, affinities[..., 1:], affinities[..., 1:, :])
     return torch.where(known, values, solve_field(system, FILL_STEPS)), known
 

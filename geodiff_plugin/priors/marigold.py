@@ -20,7 +20,8 @@ class MarigoldPrior(DepthPrior):
     pipeline_class: type[Any] = MarigoldDepthPipeline
 
     def __init__(self, pipe: Any) -> None:
-        self._pipe, self.config = pipe, pipe.config
+        self._pipe = pipe
+        self.config = pipe.config
 
     @property
     def network_input(self) -> slice:

@@ -311,12 +311,9 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         resampling = resample_method_output or self.output_resampling
         check_number(ensemble_size, "ensemble_size", 2 if output_uncertainty else 1, 1 << 20, integer=True)
         check_number(batch_size, "batch_size", 1, 1 << 20, integer=True)
-        check_choice(output_type, "output_type", ("np", "pt"))
-        check_choice(resample_method_input, "resample_method_input", RESAMPLING)
-        check_choice(resampling, "resample_method_output", RESAMPLING)
-        if unknown := set(options) - set(self.call_options()):
-            bad_value("arguments of this prior", f"among {self.call_options()}", sorted(unknown))
-        processor, place = self.image_processor, (self._execution_device, self.dtype)
+        self._check_choices(output_type, resample_method_input, resampling, options)
+        processor = self.image_processor
+        place = (self._execution_device, self.dtype)
         padded, padding, size = processor.preprocess(image, resolution, resample_method_input, *place)
         padded = padded.contiguous()  # (N, 3, H, W); in another layout a network rounds differently
         condition = self.prepare_condition(padded, ensemble_size, batch_size, generator, **options)
@@ -343,6 +340,14 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         )
         self.maybe_free_model_hooks()
         return output if return_dict else (output.prediction, output.uncertainty, output.latent)
+
+    def _check_choices(self, output_type: str, resample_in: str, resample_out: str, options: Any) -> None:
+        """Raise an ``InputError`` for an unknown choice or argument of a call."""
+        check_choice(output_type, "output_type", ("np", "pt"))
+        check_choice(resample_in, "resample_method_input", RESAMPLING)
+        check_choice(resample_out, "resample_method_output", RESAMPLING)
+        if unknown := set(options) - set(self.call_options()):
+            bad_value("arguments of this prior", f"among {self.call_options()}", sorted(unknown))
 
     def call_options(self) -> list[str]:
         """Return further arguments of the call: the keywords of this prior's ``prepare_condition``."""

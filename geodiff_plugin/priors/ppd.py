@@ -70,7 +70,8 @@ def semantic_tokens(encoder: Dinov2Model, image_01: Tensor) -> Tensor:
     """
     mean, std = (image_01.new_tensor(v).view(1, 3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
     rows, columns = image_01.shape[-2] // SIDE, image_01.shape[-1] // SIDE
-    patch, embeddings = encoder.config.patch_size, encoder.embeddings
+    patch = encoder.config.patch_size
+    embeddings = encoder.embeddings
     view = F.interpolate((image_01 - mean) / std, (rows * patch, columns * patch), mode="bicubic")
     patches = embeddings.patch_embeddings(view)  # (B, n, C)
     tokens = torch.cat([embeddings.cls_token.expand(len(patches), -1, -1), patches], dim=1)
@@ -129,7 +130,8 @@ class _Attention(nn.Module):
 class _Block(nn.Module):
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
-        self.attn, hidden = _Attention(width, heads), int(width * mlp_ratio)
+        self.attn = _Attention(width, heads)
+        hidden = int(width * mlp_ratio)
         layers = {"fc1": nn.Linear(width, hidden), "act": nn.GELU("tanh"), "fc2": nn.Linear(hidden, width)}
         self.mlp = nn.Sequential(OrderedDict(layers))
         self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 6 * width))
@@ -173,7 +175,8 @@ class PixelDiT(ModelMixin, ConfigMixin):
 
         ``semantics`` are ``(B, n, C)``, one token per coarse patch; ``timestep`` is in [0, 1000].
         """
-        patch, head_size = self.config.patch_size, self.config.hidden_size // self.config.num_heads
+        patch = self.config.patch_size
+        head_size = self.config.hidden_size // self.config.num_heads
         rows, columns = x.shape[-2] // (2 * patch), x.shape[-1] // (2 * patch)
         angles = timestep.reshape(-1).expand(len(x)), TIME_FREQUENCIES
         time = get_timestep_embedding(*angles, flip_sin_to_cos=True, downscale_freq_shift=0)

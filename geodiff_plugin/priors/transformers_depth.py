@@ -78,11 +78,14 @@ class Preparation:
             bad_value(f"size {file}", "a number, or a height and a width", size)
 
     def _grid(self, height: int, width: int) -> _Grid:
-        options, rows, columns = self.options, 0, 0
+        options = self.options
+        rows = 0
+        columns = 0
         if self.kind == "ZoeDepth" and options["do_pad"]:
             rows, columns = int((height / 2) ** 0.5 * 3), int((width / 2) ** 0.5 * 3)
         h, w = self._resized(height + 2 * rows, width + 2 * columns)
-        zeros, divisor = [0, 0, 0, 0], options.get("size_divisor")
+        zeros = [0, 0, 0, 0]
+        divisor = options.get("size_divisor")
         if self.kind in PADDED_LAST and options["do_pad"] and divisor:
             missing = -w % divisor, -h % divisor
             zeros = [part for n in missing for part in (n // 2, n - n // 2)]
@@ -113,7 +116,8 @@ class Preparation:
         if min(size) < 1:
             bad_value("image", "at least as large as a patch of the network", f"{x.shape[-1]}x{x.shape[-2]}")
         if size != tuple(x.shape[-2:]):
-            mode, corners = MODES[self.options["resample"]], self.kind == "ZoeDepth"
+            mode = MODES[self.options["resample"]]
+            corners = self.kind == "ZoeDepth"
             antialias = self.kind not in ALIASED
             x = F.interpolate(x, size, mode=mode, align_corners=corners, antialias=antialias)
             x = x.clamp(0.0, 1.0) if antialias else x  # the library resizes bytes, which cannot overshoot
@@ -166,7 +170,8 @@ def output_of(model: PreTrainedModel) -> tuple[str, bool]:
     DPT predicts metres with the projection that only DINOv2's depth heads have, DepthPro only with the head
     for its field of view, Prompt Depth Anything only with a prompt.
     """
-    name, config = type(model).__name__.removesuffix("ForDepthEstimation"), model.config
+    name = type(model).__name__.removesuffix("ForDepthEstimation")
+    config = model.config
     if name in ("DepthAnything", "DPT"):
         metres = config.depth_estimation_type == "metric" if name != "DPT" else config.add_projection
         return ("depth", True) if metres else ("disparity", False)
@@ -265,7 +270,8 @@ class TransformersDepthPipeline(DirectMapPipeline):
             prompt_depth = torch.as_tensor(prompt_depth)
             if prompt_depth.ndim != 4 or len(prompt_depth) != len(image):
                 bad_value("prompt_depth", f"({len(image)}, 1, h, w) metres", tuple(prompt_depth.shape))
-        size, parts = (image.shape[-2], image.shape[-1]), image.split(batch_size)
+        size = (image.shape[-2], image.shape[-1])
+        parts = image.split(batch_size)
         prompts = [None] * len(parts) if prompt_depth is None else prompt_depth.split(batch_size)
         maps = [
             self.predict(part.float() / 2 + 0.5, size, prompt)

@@ -192,7 +192,8 @@ def _warped(right: View, depth_m: Tensor, left: Camera) -> tuple[Tensor, Tensor]
     warped = right_01.new_empty((1, right_01.shape[1], height, width))
     visible = torch.empty_like(depth_m, dtype=torch.bool)
     for rows in row_strips(height, width):
-        strip_m, strip = depth_m[:, :, rows], left.cropped((0, rows.start, width, rows.stop))
+        strip_m = depth_m[:, :, rows]
+        strip = left.cropped((0, rows.start, width, rows.stop))
         part = warp_right_to_left(
             right_01, strip_m, plane_rays(strip_m, [strip], [right.camera], [right.T_right_from_left])
         )

@@ -63,7 +63,8 @@ def remaining_confidence(depth_m: Tensor, camera: Camera, views: Sequence[View],
     below ``RIGHT_WITHIN`` with probability ``erf(RIGHT_WITHIN / (sqrt(2) s))``. The factor is this
     probability with the ``extra`` error divided by the one without it.
     """
-    z_m, K = depth_m[0, 0].numpy(force=True), camera.K.astype(np.float64)
+    z_m = depth_m[0, 0].numpy(force=True)
+    K = camera.K.astype(np.float64)
     poses = [np.linalg.inv(view.T_right_from_left.astype(np.float64)) for view in views]
     without, with_extra = (
         torch.from_numpy(z_m / expected_error(z_m, K, poses, extra=each)) for each in (NO_ERROR, extra)

@@ -113,28 +113,22 @@ def finish(
     Args:
         evidence: evidence of the image, from phase 1.
         members: ensemble members, from phase 2.
-        depth_m: ``(1, 1, H, W)`` metres, the reduced ensemble, at the image's or the processing size; changed
-            in place.
+        depth_m: ``(1, 1, H, W)`` metres, the reduced ensemble, at any size; changed in place.
         uncertainty: ``(1, 1, H, W)`` metres, the ensemble spread; ``None`` if not requested.
         options: options of the call.
     """
-    native, device = evidence.native, evidence.native.left.image_01.device
-    depth_m, uncertainty = _one_map(members, depth_m.float().to(device), uncertainty, options)
+    native = evidence.native
+    depth_m = depth_m.float().to(native.left.image_01.device)
+    depth_m, uncertainty = _one_map(members, depth_m, uncertainty, options)
     left = native.left.resized(image_size(depth_m))
     left_01 = left.image_01[None]
     uncertainty = None if uncertainty is None else uncertainty.to(depth_m)
-    refined = (
-        refine(evidence, members, depth_m, left_01, options.config) if options.config.refine_edges else None
-    )
-    prior_error, confidence, support = _error_of(members), None, None
+    prior_error = _error_of(members)
+    confidence = support = None
+    refined = refine(evidence, members, depth_m, left_01, options.config)
     if refined is not None:
-        depth_m = refined.depth_m.clamp(max=_farthest_m(evidence, options.config))
-        if uncertainty is not None:
-            uncertainty = _spread_of_members(evidence, members, depth_m, left_01, options)
-        spread = None if uncertainty is None else uncertainty / depth_m
-        confidence, support = depth_confidence(refined.features, spread, prior_error), refined.support
-        if (certainty := _mean(members, "certainty")) is not None:
-            confidence = confidence * F.interpolate(certainty, image_size(confidence), mode="bilinear")
+        maps = _maps_of(refined, evidence, members, uncertainty, left_01, options)
+        depth_m, uncertainty, confidence, support = maps
         del refined  # full-size maps, freed to save memory
     visible, error = reprojection(native.rights, depth_m, left) if native.rights else (None, None)
     relative = median(cat_samples([member.relative for member in members]), 0)[None]
@@ -169,6 +163,26 @@ def finish(
     )
 
 
+def _maps_of(
+    refined: Refined,
+    evidence: Evidence,
+    members: Sequence[Member],
+    uncertainty: Tensor | None,
+    left_01: Tensor,
+    options: ResultOptions,
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+    """Return depth, uncertainty, confidence and data support ``(1, 1, H, W)`` after edge refinement."""
+    depth_m = refined.depth_m.clamp(max=_farthest_m(evidence, options.config))
+    if uncertainty is not None:
+        uncertainty = _spread_of_members(evidence, members, depth_m, left_01, options)
+    spread = None if uncertainty is None else uncertainty / depth_m
+    confidence = depth_confidence(refined.features, spread, _error_of(members))
+    certainty = _mean(members, "certainty")
+    if certainty is not None:
+        confidence = confidence * F.interpolate(certainty, image_size(confidence), mode="bilinear")
+    return depth_m, uncertainty, confidence, refined.support
+
+
 def _mask_result(
     valid: Tensor, depth_m: Tensor, confidence: Tensor | None, uncertainty: Tensor | None, fill: bool
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
@@ -189,7 +203,8 @@ def _remaining(
     evidence: Evidence, depth_m: Tensor, camera: Camera, facts: FactSheet, config: GuidanceConfig
 ) -> Tensor:
     """Compute the factor ``(1, 1, H, W)`` on confidence from the image's facts; 0 where there is no depth."""
-    native, error = evidence.native, match_error(facts)
+    native = evidence.native
+    error = match_error(facts)
     factor = confidence_factor(facts) * (depth_m < _farthest_m(evidence, config))
     return (
         factor if error == NO_ERROR else factor * remaining_confidence(depth_m, camera, native.rights, error)
@@ -262,13 +277,16 @@ def refine(
     Edges are sharpened first, so that the fit does not spread the depth of one surface to the next.
     Half-occlusions are fitted to the depth of the background; the confidence features do not count them as
     matches. Planar regularization comes last, since filtering makes patches on walls with imprecise matches.
-    ``left_01 (1, 3, H, W)`` has the size of the map. ``None`` if there are neither matches nor points.
+    ``left_01 (1, 3, H, W)`` has the size of the map. ``None`` without ``config.refine_edges``, or if there
+    are neither matches nor points.
     """
     matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
-    if matches is None and points is None:
+    if not config.refine_edges or (matches is None and points is None):
         return None
-    weight, error = _mean(members, "match_weight"), _error_of(members)
-    spacing, denoised_m = max(image_size(depth_m)) / max(image_size(members[0].relative)), depth_m
+    weight = _mean(members, "match_weight")
+    error = _error_of(members)
+    spacing = max(image_size(depth_m)) / max(image_size(members[0].relative))
+    denoised_m = depth_m
     depth_m = sharpen_edges(depth_m, left_01, max(1, round(spacing)))
     target = fit_target(matches, points, weight, error, depth_m)
     if target is None or error is None:
@@ -294,7 +312,8 @@ def _half_occlusions_on(evidence: Evidence, size: tuple[int, int]) -> HalfOcclus
     """Return the half-occlusions on a grid; ``None`` if no rows of the image were matched."""
     if evidence.rows is None:
         return None
-    rows, left = evidence.rows, evidence.native.left
+    rows = evidence.rows
+    left = evidence.native.left
     focal_px = float(left.camera.K[0, 0]) * rows.shift.shape[1] / left.size[1]
     return half_occlusions(rows, size, focal_px)
 
@@ -324,7 +343,8 @@ def _spread_of_members(
     evidence: Evidence, members: Sequence[Member], depth_m: Tensor, left_01: Tensor, options: ResultOptions
 ) -> Tensor:
     """Refine each member like ``depth_m`` and compute the spread around it, ``(1, 1, H, W)`` metres."""
-    size, refined_m = image_size(depth_m), []
+    size = image_size(depth_m)
+    refined_m = []
     for member in members:
         member_m = _member_at(size, member, depth_m, options)
         refined = refine(evidence, [member], member_m, left_01, options.config)
@@ -363,7 +383,8 @@ def _stage(evidence: Evidence, members: Sequence[Member], maps: _Maps, options: 
     matches, points = evidence.matches, evidence.points
     if matches is None and evidence.native.rights:
         with suppress(InputError):  # views without overlap are not assessed
-            matches, points = _match(evidence, options.config), None
+            matches = _match(evidence, options.config)
+            points = None
             correlation = order_agreement(maps.relative, matches, members[0].metric.space).mean()
     edges = [m.on_edge for m in members if m.on_edge is not None]
     volume = evidence.volume

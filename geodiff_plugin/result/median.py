@@ -132,7 +132,8 @@ def _filtered(given: Voters, left: Tensor, error: Tensor, sharpness: Tensor) -> 
     """
     error = _error_at_edges(error, sharpness)
     map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
-    rows, shift = given.rows, given.px / given.depth_m
+    rows = given.rows
+    shift = given.px / given.depth_m
     of_rows = given.known * (ROW_WEIGHT * rows.certain + FILLED_WEIGHT * rows.filled)
     # The confidence of a known point is a pixel count.
     of_matches = given.known * given.confidence.clamp(0.0, 1.0)
@@ -196,7 +197,8 @@ def _step_fractions(depth_m: Tensor) -> Tensor:
     near, wide = (range_around(log_depth, radius) for radius in (NEAR_RADIUS, WIDE_RADIUS))
     at_edge = (near > MIN_EDGE) & (wide < MAX_RISE * near)
     step = highest(torch.maximum(across, down), NEAR_RADIUS)
-    fractions, inner = torch.full_like(depth_m, torch.nan), slice(WIDE_RADIUS, -WIDE_RADIUS)
+    fractions = torch.full_like(depth_m, torch.nan)
+    inner = slice(WIDE_RADIUS, -WIDE_RADIUS)
     fractions[inner, inner] = torch.where(at_edge, step / near, torch.nan)[0, 0, inner, inner]
     return fractions
 
@@ -213,7 +215,9 @@ def weighted_median(values: Tensor, weight: Tensor) -> Tensor:
 
     If all weights are 0, the result is about the minimum.
     """
-    low, high, half = values.amin(0), values.amax(0), weight.sum(0) / 2.0
+    low = values.amin(0)
+    high = values.amax(0)
+    half = weight.sum(0) / 2.0
     counted = torch.empty_like(weight)
     for _ in range(ROUNDS):
         middle = 0.5 * (low + high)
@@ -243,7 +247,9 @@ def _vote_in_windows(
     for first in range(0, height, rows_at_once):
         rows = slice(first, min(height, first + rows_at_once))
         around = _windows(padded[:, rows.start : rows.stop + 2 * HALO], places)
-        values, weights, colours = around[:count], around[count : 2 * count], around[2 * count :]
+        values = around[:count]
+        weights = around[count : 2 * count]
+        colours = around[2 * count :]
         colour_weight = (colours - left[:, None, rows]).abs_().mean(0).div_(-BRIGHTNESS).exp_() * of_window
         own = shift[rows][None]
         values = torch.cat([own, values.flatten(0, 1)])
@@ -258,7 +264,9 @@ def _windows(padded: Tensor, places: Tensor) -> Tensor:
     ``places (2, n)`` are rows and columns of the whole window of ``2 HALF_WINDOW + 1`` samples, from 0.
     """
     of_layer, of_row, _ = padded.stride()
-    side, height, width = 2 * HALF_WINDOW + 1, padded.shape[1] - 2 * HALO, padded.shape[2] - 2 * HALO
+    side = 2 * HALF_WINDOW + 1
+    height = padded.shape[1] - 2 * HALO
+    width = padded.shape[2] - 2 * HALO
     shape = len(padded), side, side, height, width
     strides = of_layer, SPACING * of_row, SPACING, of_row, 1
     down, right = places
@@ -288,7 +296,8 @@ def _upsampled(filtered: Tensor, left: Tensor, whole: Tensor) -> Tensor:
         for down in (-1, 0, 1):
             for right in (-1, 0, 1):
                 v, u = y.round() + down, x.round() + right
-                row, column = v.long().clamp(0, rows - 1)[:, None], u.long().clamp(0, columns - 1)
+                row = v.long().clamp(0, rows - 1)[:, None]
+                column = u.long().clamp(0, columns - 1)
                 colour_distance = (left[:, row, column] - whole[:, part]).abs().mean(0) / BRIGHTNESS
                 away = (v - y)[:, None] ** 2 + (u - x) ** 2
                 values.append(filtered[row, column])

@@ -219,7 +219,8 @@ def stack_results(
     else:
         (numbers,) = to_host(numbers)
     K = torch.from_numpy(np.stack([result.camera.K for result in results]))
-    poses, estimated = [result.evidence.report for result in results], guidance.estimated
+    poses = [result.evidence.report for result in results]
+    estimated = guidance.estimated
     output = MetricDepthOutput(
         prediction=maps.pop("depth_m"),
         **maps,
@@ -257,7 +258,8 @@ def _sigma(output: MetricDepthOutput) -> np.ndarray:
     for i, (depth_m, confidence, deviation_m) in enumerate(zip(*columns, strict=True)):
         geometric_m = None
         if output.K is not None and len(output.poses) == len(output.prediction):
-            K, facts = on_host(output.K[i]).astype(np.float64), output.verdicts[i].facts
+            K = on_host(output.K[i]).astype(np.float64)
+            facts = output.verdicts[i].facts
             geometric_m = geometric_sigma(depth_m, K, output.poses[i].E, facts)
         sigma_m.append(depth_sigma(depth_m, confidence, geometric_m, deviation_m, output.scale_rel_std))
     return np.stack(sigma_m)

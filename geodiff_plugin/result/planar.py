@@ -99,7 +99,8 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, de
         Map like ``depth_m``.
     """
     log_depth = depth_m.float().log()
-    mean_log_depth, prior_weight = log_depth.mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
+    mean_log_depth = log_depth.mean()
+    prior_weight = (WEAK_PRIOR / error).clamp_min(1.0) ** 4
     on_grid = _on(log_depth, target.size)
     known = _known_maps(target, on_grid, mean_log_depth, prior_weight)
     surface = _Surface(known.inverse, _affinities_of_walls(on_grid, denoised_m, left_01, prior_weight))
@@ -212,7 +213,9 @@ def _fit_slopes(slopes: Tensor, surface: _Surface, weight: Tensor, start: Tensor
 @has_kernel("result.kernels.planar.slopes")
 def _slopes(inverse: Tensor, known: Tensor, affinities: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Compute weight and right-hand side ``(2, 1, h, w)`` for the horizontal and vertical slopes."""
-    own, weights, right_sides = known**2 + MIN_SLOPE_WEIGHT, [], []
+    own = known**2 + MIN_SLOPE_WEIGHT
+    weights = []
+    right_sides = []
     for axis, link in zip((-1, -2), affinities, strict=True):
         weights.append(_after(link, axis, first=False) * own + 1e-6)
         right_sides.append(weights[-1] * _after(inverse.diff(dim=axis), axis, first=False))

@@ -203,7 +203,8 @@ class StepEstimate:
         self.output, wide_z_t = (x[:, codec.prior.depth_channels].to(self._wide) for x in (output, z_t))
         self.eps = noise_from(self.output, wide_z_t, level)
         self.latent = z0_from(self.output, wide_z_t, level) if hook is None else hook.leaf
-        self.encode, self.latent_is_read = codec.encode, latent_is_read
+        self.encode = codec.encode
+        self.latent_is_read = latent_is_read
 
     def z0(self, latent: Tensor) -> Tensor:
         """Compute the clean latent of ``latent``: Tweedie through the network ("full"), or the identity."""
@@ -222,7 +223,8 @@ class StepEstimate:
         With the full gradient and ``from_updated`` the step starts from the updated z_t. Without
         ``from_updated`` the offset is added to the step's result.
         """
-        updated, prior = (self.latent + offset).detach(), self._codec.prior
+        updated = (self.latent + offset).detach()
+        prior = self._codec.prior
         if self._hook is None:
             output, z_t = output_from(updated, self.eps, self._level)
             return StepInputs(self._put(self._output, output), self._put(self._z_t, z_t))

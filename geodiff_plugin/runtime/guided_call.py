@@ -300,7 +300,8 @@ def _check_arguments(call: Mapping[str, Any], images: int) -> None:
             check_number(call[name], name, minimum, MAX_COUNT, integer=True)
     for name in ("batch_size", "ensemble_size"):
         check_number(call[name], name, 1, MAX_COUNT, integer=True)
-    given, members = call["generator"], images * call["ensemble_size"]
+    given = call["generator"]
+    members = images * call["ensemble_size"]
     generators = given if isinstance(given, list) else [given]
     if given is not None and not all(isinstance(each, torch.Generator) for each in generators):
         bad_type("generator", "None, a torch.Generator or a list of them", given)

@@ -75,7 +75,8 @@ def layers_of(network: torch.nn.Module) -> list[torch.nn.Module]:
     ``modules()`` nests one generator per level and takes ten times as long: milliseconds during which a GPU
     idles.
     """
-    found, queue = dict[int, torch.nn.Module](), [network]
+    found = dict[int, torch.nn.Module]()
+    queue = [network]
     while queue:
         layer = queue.pop()
         if id(layer) not in found:
@@ -194,7 +195,8 @@ class DenoiserHook:
     @contextmanager
     def attached(self) -> Iterator[None]:
         """Override the method; restore it and drop the graph at exit."""
-        stock, thread = getattr(self._owner, self._method), threading.get_ident()
+        stock = getattr(self._owner, self._method)
+        thread = threading.get_ident()
 
         @functools.wraps(stock)
         def hooked_method(model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
@@ -231,7 +233,8 @@ class DenoiserHook:
                 spliced = put_channels(model_input, self._channels, z_t.to(model_input.dtype))
                 return forward(spliced, *args, **kwargs)
 
-        self._rerun, self._leaf = at, model_input[:, self._channels].to(wide).requires_grad_()
+        self._rerun = at
+        self._leaf = model_input[:, self._channels].to(wide).requires_grad_()
         result = at(self._leaf)
         self._output = _first(result)
         detached = self._output.detach()
@@ -278,7 +281,8 @@ class GuidedScheduler:
     @contextmanager
     def attached(self) -> Iterator[None]:
         """Install the guided scheduler on the pipeline; re-entering during a call continues it."""
-        original, outside = self._pipe.scheduler, vars(self._scheduler)
+        original = self._pipe.scheduler
+        outside = vars(self._scheduler)
         self._scheduler.__dict__ = self._inside
         # Bypass ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config.
         object.__setattr__(self._pipe, "scheduler", self._scheduler)
@@ -290,7 +294,8 @@ class GuidedScheduler:
 
     def release(self) -> None:
         """Break the reference cycle between this object and the wrapped methods after a call."""
-        self._inside, self._run = {}, None
+        self._inside = {}
+        self._run = None
 
     def _wrapped(self) -> dict[str, Callable[..., Any]]:
         """Return the two guided methods as instance attributes that override the methods of the class."""
@@ -306,7 +311,8 @@ class GuidedScheduler:
                 trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._trailing_spacing else None
             )
             self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()
-            self._numbers, self._done = self._timesteps.tolist(), 0
+            self._numbers = self._timesteps.tolist()
+            self._done = 0
             self._run.begin(self._timesteps)
             # The pipeline's loop iterates over these timesteps on its own device.
             scheduler.timesteps = self._timesteps.to(device, non_blocking=True)
@@ -314,7 +320,8 @@ class GuidedScheduler:
         @functools.wraps(stock_step)
         def step(model_output: Tensor, timestep: Any, sample: Tensor, *args: Any, **kwargs: Any) -> Any:
             given = timestep
-            scheduler.timesteps, timestep = self._timesteps, self._timesteps[self._done]
+            scheduler.timesteps = self._timesteps
+            timestep = self._timesteps[self._done]
             self._done += 1
             output, z_t, offset = self._run.guide(model_output, timestep, sample)
             number = self._numbers[self._done - 1] if is_ddim else timestep

@@ -79,7 +79,8 @@ def _family(scheduler: Any) -> Callable[[Any, Tensor], NoiseLevel]:
 def check_scheduler(scheduler: Any) -> None:
     """Raise an error for unsupported schedulers: unknown family, 0 / 0 at zero SNR, or thresholding."""
     _family(scheduler)
-    name, config = type(scheduler).__name__, scheduler.config
+    name = type(scheduler).__name__
+    config = scheduler.config
     if getattr(config, "rescale_betas_zero_snr", False) and config.prediction_type == "epsilon":
         expected = "able to compute the clean latent from the network's output at every step"
         got = f"{name} with prediction_type='epsilon' and rescale_betas_zero_snr=True"

@@ -28,7 +28,8 @@ def prefetch_evidence(
         among: number of threads of the program that compute at the same time and share the cores.
         kernels: whether Triton kernels may be used.
     """
-    plain, chosen = torch.autocast(device.type, enabled=False), without_kernels(not kernels)
+    plain = torch.autocast(device.type, enabled=False)
+    chosen = without_kernels(not kernels)
     with WithinCores(among), torch.no_grad(), plain, chosen:
         work = partial(guidance.prefetch, left, device)
         return BackgroundTask(work, device, own_stream=True, follows=False).result()

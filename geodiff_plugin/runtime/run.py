@@ -61,16 +61,20 @@ class GuidedRun:
         self.schedule: Schedule | None = None
         self.trajectories: list[Trajectory] = []  # one per chunk, created at its first guided step
         self.members: list[Member] = []  # of all images; the members of one image are consecutive
-        self._plan, self._rounds, self._callback = guidance.updates, rounds, callback
+        self._plan = guidance.updates
+        self._rounds = rounds
+        self._callback = callback
         self._reads_latents = call["output_latent"] or callback is not None
         self._codec = codec
-        self._chunk, self._step = -1, 0
+        self._chunk = -1
+        self._step = 0
         self._first_output: Tensor | None = None  # network output at the first step of the chunk
         self._timesteps: list[float] = []
         self._shown: Tensor | None = None  # relative map of the chunk's latest evaluation
         self._results: list[Tensor | None] = []  # per chunk, the map that its output starts from
         self._decoded = 0  # number of chunks whose final latents were decoded
-        self._stack, self._bar = ExitStack(), None
+        self._stack = ExitStack()
+        self._bar = None
         self._denoiser = None
         if guidance.through_network and self.prior.network_input is not None:
             self._denoiser = hooks.DenoiserHook(*self.prior.network(), self.prior.network_input)
@@ -80,7 +84,8 @@ class GuidedRun:
         with ExitStack() as stack:
             if self._plan.guidance_steps:  # otherwise nothing is differentiated
                 stack.enter_context(hooks.frozen_weights(self.pipe))
-            image, preprocessed = self.call["image"], self._codec.grid.preprocessed
+            image = self.call["image"]
+            preprocessed = self._codec.grid.preprocessed
             stack.enter_context(hooks.images_in_float32(self.pipe.image_processor, image, preprocessed))
             if self.pipe._faster is not None:
                 stack.enter_context(self.pipe._faster.attached(self.pipe))
@@ -129,7 +134,8 @@ class GuidedRun:
         ``findings`` concern the input; those that are reasons are added to every verdict.
         """
         guidance, call = self.guidance, self.call
-        size, count = call["ensemble_size"], len(guidance.inputs)
+        size = call["ensemble_size"]
+        count = len(guidance.inputs)
         of_images = [self.members[first : first + size] for first in range(0, count * size, size)]
         options = ResultOptions(
             self.config,
@@ -174,10 +180,13 @@ class GuidedRun:
         """Start the trajectory of the next chunk with its timesteps on the CPU."""
         self._chunk += 1
         self._results.append(None)
-        self._step, self._timesteps = 0, timesteps.tolist()
+        self._step = 0
+        self._timesteps = timesteps.tolist()
         self._shown = self._first_output = None
         if self.schedule is None:
-            rounds, encodes, count = self._rounds, self._denoiser is None, len(timesteps)
+            rounds = self._rounds
+            encodes = self._denoiser is None
+            count = len(timesteps)
             self.schedule = make_schedule(self.config, self._plan, count, rounds=rounds, encodes=encodes)
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
             chunks = -(-len(self._image_of_sample) // self.call["batch_size"])

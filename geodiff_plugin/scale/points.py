@@ -179,7 +179,8 @@ def _refine_once(
         return form.forward(v, torch.ones_like(v)).clamp_min(1e-9).log()
 
     fractions = torch.stack([1.0 - values, values], -1)  # (B, P, 2)
-    v, span = (fractions @ ends[:, :, None])[..., 0], (ends[:, 1:] - ends[:, :1]).abs()
+    v = (fractions @ ends[:, :, None])[..., 0]
+    span = (ends[:, 1:] - ends[:, :1]).abs()
     h = 1e-3 * torch.maximum(span, 1e-2 * ends.abs().amax(1, keepdim=True))
     # The relative noise is evaluated at the map's depth. At the match's depth, the nearer of two far matches
     # with opposite errors would weigh more.

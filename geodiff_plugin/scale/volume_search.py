@@ -48,12 +48,14 @@ class _Best(NamedTuple):
 
 def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> Groups:
     """Sort values ``x (P,)``, with ``cost`` and ``in_view (D, P)``, into groups of equal size."""
-    order, each = x.argsort(), group_size(len(x))
+    order = x.argsort()
+    each = group_size(len(x))
 
     def summed(values: Tensor) -> Tensor:
         return F.pad(values[..., order], (0, -len(x) % each)).unflatten(-1, (-1, each)).sum(-1)
 
-    seen, size = in_view.to(cost), summed(torch.ones_like(x))
+    seen = in_view.to(cost)
+    size = summed(torch.ones_like(x))
     return Groups(summed(x) / size, size, summed(seen), summed(cost.clamp_max(COST_CLAMP) * seen))
 
 
@@ -174,7 +176,8 @@ def _coarse_to_fine(
 ) -> _Best:
     """Search the best ends in [low, high] on a coarse grid, then on two finer ones."""
     grid = torch.linspace(0, 1, COARSE_GRID, dtype=like.dtype, device=like.device)
-    log_low, log_span = math.log(low), math.log(high / low)
+    log_low = math.log(low)
+    log_span = math.log(high / low)
     i, j = torch.triu_indices(COARSE_GRID, COARSE_GRID, 1, device=like.device)
     best = best_of(*(torch.exp(log_low + log_span * grid[k]) for k in (i, j)))
     radius = log_span / (COARSE_GRID - 1)

@@ -133,7 +133,8 @@ def _results(
     run: Callable[[PreparedFrame], MetricDepthOutput], source: Iterable[Any], rig: LiveRig, *, waits: bool
 ) -> Generator[LiveFrame, None, None]:
     """Run the threads and yield the results."""
-    arrived, ready = Newest[_Numbered](waits=waits), Newest[tuple[_Numbered, PreparedFrame]](waits=True)
+    arrived = Newest[_Numbered](waits=waits)
+    ready = Newest[tuple[_Numbered, PreparedFrame]](waits=True)
 
     def read() -> None:
         for number, frame in enumerate(source):
@@ -150,7 +151,8 @@ def _results(
     try:
         while (next_one := ready.take()) is not None:
             numbered, prepared = next_one
-            output, frame = run(prepared), numbered.frame
+            output = run(prepared)
+            frame = numbered.frame
             latency_s = time.perf_counter() - frame.arrived_s
             yield LiveFrame(output, prepared.left, numbered.number, frame.stamp, latency_s, prepared.checked)
     finally:

@@ -16,7 +16,8 @@ class Newest(Generic[T]):
     """
 
     def __init__(self, *, waits: bool = False) -> None:
-        self._changed, self._waits = threading.Condition(), waits
+        self._changed = threading.Condition()
+        self._waits = waits
         self._values: list[T] = []  # at most one
         self._closed = False
         self._error: BaseException | None = None
@@ -54,5 +55,6 @@ class Newest(Generic[T]):
         A last value can still be taken, unless its sender waits for that. Then ``error`` is raised.
         """
         with self._changed:
-            self._closed, self._error = True, self._error or error
+            self._closed = True
+            self._error = self._error or error
             self._changed.notify_all()

@@ -47,7 +47,8 @@ def setup_of_rig(rig: Rig, config: GuidanceConfig, mask: Any = None, right_mask:
     """Return the setup of a calibrated rig; the masks are for images without lens distortion."""
 
     def setup(left: np.ndarray, right: np.ndarray) -> RigSetup:
-        images, sizes = (left, right), [(image.shape[1], image.shape[0]) for image in (left, right)]
+        images = (left, right)
+        sizes = [(image.shape[1], image.shape[0]) for image in (left, right)]
         hint = "Use the size that the rig was calibrated for, or scale its K."
         for size, name, calibrated in zip(
             sizes, ("left", "right"), (rig.size_left, rig.size_right), strict=True
@@ -131,7 +132,8 @@ class LiveRig:
             if checks or self._count == 0:
                 self._check_images(setup.guidance, left, right)
             guidance = setup.guidance.for_frame(right, *self._masks)
-            guidance.config, guidance.checked = self._config, None if checks else self._poses
+            guidance.config = self._config
+            guidance.checked = None if checks else self._poses
             (plan,) = prefetch_evidence(
                 guidance, left, self._device, among=self._among, kernels=self._kernels
             )
@@ -143,7 +145,8 @@ class LiveRig:
 
     def _check_images(self, guidance: GeometryGuidance, left: np.ndarray, right: np.ndarray) -> None:
         """Find black borders, and whether the images of this rig need cleaning."""
-        self._masks, config = _valid_pixels(guidance, left, right), guidance.config
+        self._masks = _valid_pixels(guidance, left, right)
+        config = guidance.config
         images = [as_image_01(image, "frame") for image in (left, right)]
         clean = all(one is other for one, other in zip(images, cleaned(images, config), strict=True))
         pose = "refine" if self._check_every else "given"

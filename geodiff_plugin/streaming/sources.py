@@ -69,7 +69,9 @@ class CameraSource:
     ) -> None:
         if len(sources) not in (1, 2):
             bad_value("source", "one source that holds both views, or two", f"{len(sources)} sources")
-        self._names, self.packing, self._open = [str(source) for source in sources], packing, ExitStack()
+        self._names = [str(source) for source in sources]
+        self.packing = packing
+        self._open = ExitStack()
         self._captures = [self._opened(name, size) for name in self._names]
         is_file = not any(map(_is_live, self._names))
         rate = self._captures[0].get(cv2.CAP_PROP_FPS) or DEFAULT_RATE
@@ -99,7 +101,8 @@ class CameraSource:
         self._open.close()
 
     def __iter__(self) -> Iterator[StereoFrame]:
-        start, count = time.perf_counter(), 0
+        start = time.perf_counter()
+        count = 0
         while self._grab():
             arrived_s = time.perf_counter()
             images = [cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2RGB) for capture in self._captures]

@@ -164,7 +164,8 @@ def residual_distortion(tracks: Tracks, T: np.ndarray) -> ResidualDistortion | N
     if len(tracks) < MIN_MATCHES:
         return None
     estimate, error = _fit_k1(tracks, T, np.zeros((len(tracks), 0)))
-    k1, bound = certain_part(estimate, error), abs(estimate) + BOUND_ERRORS * error
+    k1 = certain_part(estimate, error)
+    bound = abs(estimate) + BOUND_ERRORS * error
     if k1 == 0.0:
         return ResidualDistortion(0.0, 0.0, bound)
     sheared = (tracks.right_px[0] - tracks.K_rights[0][:2, 2]) / tracks.K_rights[0][0, 0]
@@ -196,7 +197,9 @@ def _fit_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> tuple[float
         k1 and its standard error, which is the larger of two estimates: one for independent errors of the
         matches, and one from sums over blocks of the left image, because errors of neighbours are correlated.
     """
-    pair, k1, others = _pair(tracks, T), 0.0, np.zeros(explained.shape[1])
+    pair = _pair(tracks, T)
+    k1 = 0.0
+    others = np.zeros(explained.shape[1])
     # The columns are the derivatives of the residuals by k1, by the offset and by the other explanations.
     A = np.concatenate([np.ones((len(tracks), 2)), explained], axis=1)
     for _ in range(STEPS):
@@ -209,8 +212,10 @@ def _fit_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> tuple[float
         weighted = A * weight[:, None]
         H = weighted.T @ A + 1e-9 * np.eye(A.shape[1])
         step = np.linalg.solve(H, weighted.T @ off)
-        k1, others = float(np.clip(k1 - step[0], -MAX_K1, MAX_K1)), step[2:]
-    inverse, gradients = np.linalg.inv(H), A * (weight * (off - A @ step))[:, None]
+        k1 = float(np.clip(k1 - step[0], -MAX_K1, MAX_K1))
+        others = step[2:]
+    inverse = np.linalg.inv(H)
+    gradients = A * (weight * (off - A @ step))[:, None]
     error = max(scale * float(np.sqrt(inverse[0, 0])), _error_by_blocks(inverse, gradients, blocks(tracks)))
     return k1, error
 

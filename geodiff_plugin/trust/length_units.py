@@ -83,7 +83,8 @@ class LengthUnits(Check[Lengths]):
 
     @classmethod
     def findings(cls, facts: FactSheet, earlier: Sequence[Finding]) -> Iterator[Finding]:
-        fact, stated = facts[cls], SearchRange.confirms_unit(facts)
+        fact = facts[cls]
+        stated = SearchRange.confirms_unit(facts)
         if not stated:
             yield from (finding for finding in facts.call.findings if finding.code in cls.reviews)
         if fact is None or fact.baseline_m is None:

@@ -43,7 +43,8 @@ def _stride(depth_m: Tensor) -> int:
 @has_kernel("trust.kernels.match_statistics.of_grid", when=lambda matches, depth_m: _stride(depth_m) == 1)
 def _of_grid(matches: Matches, depth_m: Tensor) -> dict[str, Tensor]:
     """Compute ``match_statistics`` for ``depth_m (1, H, W)`` on the grid of the matches."""
-    confident, step = matches.confidence > RELIABLE, matches.plane_step
+    confident = matches.confidence > RELIABLE
+    step = matches.plane_step
     in_front = confident & (matches.inverse_depth > 0)
     sample = where_known(matches.inverse_depth, in_front).flatten()[:: _stride(depth_m)]
     low, high = torch.nanquantile(sample, constant_like(sample, *RANGE_QUANTILES)).unbind()

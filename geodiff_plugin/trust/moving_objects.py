@@ -83,7 +83,8 @@ def moved_fraction(tracks: Tracks, T: np.ndarray) -> float:
     off_px = epipolar(tracks, T).off_px
     usual_px = float(np.median(np.abs(off_px))) if len(off_px) else math.nan
     kept = np.abs(off_px) < MAX_OFF_PX
-    off_px, block = off_px[kept], blocks(tracks.kept(kept))
+    off_px = off_px[kept]
+    block = blocks(tracks.kept(kept))
     count = np.bincount(block)
     median = _medians(off_px, block, count)
     deviation = _medians(np.abs(off_px - median[block]), block, count)

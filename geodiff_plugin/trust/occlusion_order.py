@@ -101,9 +101,12 @@ def occlusion_order(grey: np.ndarray, shift: np.ndarray, gaps: Gaps) -> float:
     Returns:
         A score in [-1, 1], above 0 if near surfaces occlude far ones; NaN for too few occlusions.
     """
-    far, near = gaps.first - 1, gaps.end
+    far = gaps.first - 1
+    near = gaps.end
     inside = (far >= MAX_DISTANCE_PX) & (near < grey.shape[1] - MAX_DISTANCE_PX - 1)
-    row, far, near = gaps.row[inside], far[inside], near[inside]
+    row = gaps.row[inside]
+    far = far[inside]
+    near = near[inside]
     rise = shift[row, near] - shift[row, far]
     as_wide = np.abs(near - far - 1 - rise) < np.maximum(AS_WIDE_PX, AS_WIDE * rise)
     occluded = (rise >= MIN_RISE_PX) & as_wide

@@ -122,7 +122,8 @@ class _Fits(NamedTuple):
 
 def _median(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return the median ``(N,)`` of the known values of every row ``(N, L)``; each row needs one."""
-    ordered, count = np.sort(np.where(known, values, np.inf), axis=1), known.sum(1)
+    ordered = np.sort(np.where(known, values, np.inf), axis=1)
+    count = known.sum(1)
     row = np.arange(len(values))
     return (ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2.0
 
@@ -136,8 +137,11 @@ def _fit_lines(at: np.ndarray, values: np.ndarray, known: np.ndarray) -> _Fits:
     away = np.where(known, at - (at * known).sum(1, keepdims=True) / known.sum(1, keepdims=True), 0.0)
     weight = known.astype(float)
     for _ in range(STEPS):
-        total, first, second = weight.sum(1), (weight * away).sum(1), (weight * away**2).sum(1)
-        sums, moments = (weight * values).sum(1), (weight * away * values).sum(1)
+        total = weight.sum(1)
+        first = (weight * away).sum(1)
+        second = (weight * away**2).sum(1)
+        sums = (weight * values).sum(1)
+        moments = (weight * away * values).sum(1)
         determinant = np.maximum(total * second - first**2, 1e-9)
         slope = (total * moments - first * sums) / determinant
         middle = (second * sums - first * moments) / determinant
@@ -193,7 +197,8 @@ def certain_shear(lines: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> 
     enough = (along.known.sum(1) >= MIN_MATCHED_PX) & (along.fraction >= MIN_MATCHED)
     if enough.sum() < MIN_LINES:
         return math.nan
-    lines, courses = lines[enough], _fit_lines(along.row[enough], along.shift[enough], along.known[enough])
+    lines = lines[enough]
+    courses = _fit_lines(along.row[enough], along.shift[enough], along.known[enough])
     straight = courses.scale < MAX_SCATTER_PX
     x = (lines[straight, 0] + lines[straight, 2]) / 2
     if straight.sum() < MIN_LINES or x.std() < MIN_SPREAD * shift.shape[1]:

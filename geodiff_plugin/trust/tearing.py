@@ -133,7 +133,8 @@ def _shift(above: np.ndarray, below: np.ndarray) -> tuple[float, int]:
     part = np.arange(width) * PARTS // width
     # Row k of ``shifted`` is ``above`` shifted by k - limit pixels; ``known`` marks pixels inside the image.
     shifted, known = (sliding_window_view(np.pad(row, limit), width) for row in (above, np.ones_like(above)))
-    shifted, known = np.ascontiguousarray(shifted[::-1]), known[::-1]
+    shifted = np.ascontiguousarray(shifted[::-1])
+    known = known[::-1]
     off = known * cv2.absdiff(np.tile(below, (len(shifted), 1)), shifted)  # one row per shift
     totals = _sums(off) / known.sum(1)
     unshifted = np.bincount(part, off[limit], PARTS) / np.bincount(part, minlength=PARTS)
@@ -158,5 +159,6 @@ def find_tear_row(greys: Sequence[np.ndarray], heights: Sequence[int]) -> Tear |
     if len(torn) != 1 or any(len(tear_rows) > MAX_TEARS for tear_rows in found):
         return None
     view = torn[0]
-    clearest, factor = found[view][0], heights[view] / len(greys[view])
+    clearest = found[view][0]
+    factor = heights[view] / len(greys[view])
     return Tear(view, round(clearest.row * factor), round(clearest.shift * factor))

@@ -79,7 +79,8 @@ def _plain_configuration(settings: Settings) -> dict[str, Any]:
 
 def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
     """Return all hyperparameters of a preset, the files of its decoder, and all settings except the prior."""
-    camera, pose = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]]), np.eye(4)
+    camera = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]])
+    pose = np.eye(4)
     pose[0, 3] = 0.1
     guidance = preset(np.zeros((32, 32, 3), np.uint8), camera, pose)
     chosen = _plain_configuration(settings)
@@ -102,13 +103,15 @@ def guidance_of(
 ) -> GeometryGuidance:
     """Return a preset's guidance for a sample's views, reusing evidence computed by other methods."""
     guidance = preset(*posed_views(sample, settings.views), **changes)
-    guidance.evidence_store, guidance.calibrated = priors.evidence, True
+    guidance.evidence_store = priors.evidence
+    guidance.calibrated = True
     guidance.measured_baseline = guidance.measured_baseline or sample.E_true is not None
     return guidance
 
 
 def _run_guided(preset: Preset, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-    guidance, pipe = guidance_of(sample, settings, priors, preset), priors.get(settings)
+    guidance = guidance_of(sample, settings, priors, preset)
+    pipe = priors.get(settings)
     if guidance.through_network and prior_of(pipe).network_input is None:
         raise NotApplicable("no gradient to z_t, which is not an input of this prior's network")
     return guided_prediction(pipe, sample, guidance, call_arguments(settings))
@@ -178,10 +181,12 @@ class RampPrior(DepthMapPipeline):
 def _run_ramp(preset: Preset, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     """Make a guided call on a ramp, with as many rounds of updates as the preset uses with this prior."""
     pipe = priors.get(settings)
-    adapter, of_preset = prior_of(pipe), preset(*posed_views(sample, settings.views))
+    adapter = prior_of(pipe)
+    of_preset = preset(*posed_views(sample, settings.views))
     rounds = of_preset.denoising_steps(settings.steps, pipe.default_denoising_steps)
     ramp = RampPrior(DirectScheduler(), adapter.space, rounds, pipe.default_processing_resolution or 0)
-    ramp.adapter, ramp.image_processor = adapter, pipe.image_processor
+    ramp.adapter = adapter
+    ramp.image_processor = pipe.image_processor
     ramp.to(pipe.device).set_progress_bar_config(disable=True)
     guidance = guidance_of(sample, settings, priors, preset, min_steps=rounds)
     arguments = {} if settings.resolution is None else {"processing_resolution": settings.resolution}
@@ -232,5 +237,6 @@ def variant(base: str, config: GuidanceConfig, text: str) -> Method:
         summary = "the prior guided with the default preset, poses estimated from the images"
         return _guided(name, "guided, poses estimated", summary, GeometryGuidance, _run_estimated)
     changed = config_from_text(text.split("+"), config, "methods")
-    title, preset = f"{base}, {text.replace('+', ', ')}", partial(GeometryGuidance, config=changed)
+    title = f"{base}, {text.replace('+', ', ')}"
+    preset = partial(GeometryGuidance, config=changed)
     return _guided(name, title, f"{base} with {text}", preset)

@@ -86,7 +86,8 @@ class PriorCache:
     """Loads a prior once per run, ready for guidance; ``evidence`` belongs to the most recent pairs."""
 
     def __init__(self) -> None:
-        self.evidence, self._pipes = EvidenceStore(), dict[tuple[str | bool | None, ...], Any]()
+        self.evidence = EvidenceStore()
+        self._pipes = dict[tuple[str | bool | None, ...], Any]()
 
     def get(self, settings: Settings) -> Any:
         """Return the pipeline of ``settings.prior`` with guidance enabled; errors as in ``load_prior``."""

@@ -94,7 +94,8 @@ def _run_sgbm(wls: bool, sample: StereoSample, settings: Settings, priors: Prior
 
 def _run_sweep(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     volume = sweep(sample, settings.device, settings.views)
-    matches, farthest = match_volume(volume), 0.5 * float(volume.plane_step)
+    matches = match_volume(volume)
+    farthest = 0.5 * float(volume.plane_step)
     # Matches at infinity are rejected, because the sky would spread into adjacent holes.
     matched = (matches.confidence[0] > 0) & (matches.inverse_depth[0] > farthest)
     with_holes = torch.where(matched, matches.inverse_depth[0], torch.nan).cpu().numpy()
@@ -164,7 +165,8 @@ def _read(path: Path, kind: str) -> np.ndarray:
 
 def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Prediction:
     """Resize a map to the image bilinearly, which enlarges holes by the pixels they are mixed into."""
-    size, resized = tuple(sample.left.shape[:2]), values
+    size = tuple(sample.left.shape[:2])
+    resized = values
     if values.shape != size:
         given = torch.from_numpy(values)[None, None]
         resized = F.interpolate(given, size, mode="bilinear", align_corners=False)[0, 0].numpy()
@@ -222,7 +224,8 @@ def files_method(text: str, use: str = "files") -> Method:
     kind, colon, named = text.partition(":")
     if not (colon and kind in KINDS):
         kind, named = "depth", text
-    folder, space = Path(named), kind.removeprefix("relative-")
+    folder = Path(named)
+    space = kind.removeprefix("relative-")
     if not named or not os.path.isdir(folder):
         hint = f"KIND is one of {', '.join(KINDS)}."
         bad_value("methods", f"{use}:DIR or {use}:KIND:DIR with an existing folder", repr(text), hint)
@@ -245,7 +248,8 @@ def files_method(text: str, use: str = "files") -> Method:
         maps = {"kind": kind, "files": folder_fingerprint(folder)}
         return maps | ({} if use == "files" else guided_configuration(GeometryGuidance, settings))
 
-    name, about = folder.resolve().name, f"maps of {folder.resolve().name} ({KINDS[kind]})"
+    name = folder.resolve().name
+    about = f"maps of {folder.resolve().name} ({KINDS[kind]})"
     title, summary = {
         "files": (name, about),
         "prior-map": (f"guided {name}", f"{about}, guided"),

@@ -37,12 +37,15 @@ from geodiff_plugin.types import Rig
 
 def _read_pair(ref: SampleRef) -> tuple[Images, Rig]:
     """Read images and rig from the files ``left``, ``right``, ``calibration`` and ``calibration_right``."""
-    files, second = ref.files, ref.files.get("calibration_right")
+    files = ref.files
+    second = ref.files.get("calibration_right")
     left, right, first = files["left"], files["right"], files["calibration"]
     images = read_rgb(left, "left image"), read_rgb(right, "right image")
-    given, names = first if second is None else (first, second), (left.name, right.name)
+    given = first if second is None else (first, second)
+    names = (left.name, right.name)
     height, width = images[0].shape[:2]
-    hint, left_size = str(left), (width, height)
+    hint = str(left)
+    left_size = (width, height)
     rig = read_calibration(given, files.get("cameras"), hint, image_names=names, image_size=left_size)
     sizes = (first, rig.size_left, "left"), (second or first, rig.size_right, "right")
     for image, (path, size, side) in zip(images, sizes, strict=True):
@@ -169,7 +172,8 @@ def _load_scene(ref: SampleRef) -> StereoSample:
     """Read one pair in Middlebury's format; its mask is 128 for occluded in the right view, 0 for unknown."""
     (images, rig), ground_truth, mask = _read_pair(ref), ref.files["disparity"], ref.files["mask"]
     disparity = like(images[0], ground_truth, read_map(ground_truth, "ground-truth disparity"))
-    valid, occluded = np.isfinite(disparity), None
+    valid = np.isfinite(disparity)
+    occluded = None
     if mask is not None:
         seen = read_rgb(mask, "mask of non-occluded pixels")[..., 0]
         occluded = valid & (like(images[0], mask, seen) == 128)
@@ -224,7 +228,8 @@ def _load_booster(ref: SampleRef) -> StereoSample:
     if "occluded" in masks:
         masks["occluded"] = (masks["occluded"] == 0) & (depth_m > 0)
     (left, of_left), (right, of_right) = _quartered(left, rig.left), _quartered(right, rig.right)
-    rig, notes = replace(rig, left=of_left, right=of_right), {"truth": "disp_00.npy"}
+    rig = replace(rig, left=of_left, right=of_right)
+    notes = {"truth": "disp_00.npy"}
     return make_sample(ref, (left, right), rig, depth_m, notes | {"disparity_step_px": 0.0}, **masks)
 
 
@@ -245,7 +250,8 @@ def _sources_of(path: Path) -> dict[int, list[int]]:
     try:
         sources = {}
         for i in range(int(lines[0][0])):
-            reference, row = int(lines[1 + 2 * i][0]), lines[2 + 2 * i]
+            reference = int(lines[1 + 2 * i][0])
+            row = lines[2 + 2 * i]
             sources[reference] = [int(source) for source in row[1 : 1 + 2 * int(row[0]) : 2]]
     except (IndexError, ValueError):
         layout = "a pair.txt (count, then 'id' and 'n id score ...' lines per view)"
@@ -269,7 +275,9 @@ def _find_posed(root: Path, name: str, pairs: str = "default", pixel_centre: flo
     ``pairs="all"``: every listed pair. ``pixel_centre`` is the coordinate of the top-left pixel's centre.
     """
     check_choice(pairs, "pairs", ("default", "all"))
-    refs, every, benchmark = [], pairs == "all", name == "robustmvd"
+    refs = []
+    every = pairs == "all"
+    benchmark = name == "robustmvd"
     for group in folders(root, 2):
         complete = (
             (group / "pair.txt").is_file() and (group / "cams").is_dir() and (group / "images").is_dir()
@@ -300,7 +308,8 @@ def _find_posed(root: Path, name: str, pairs: str = "default", pixel_centre: flo
 def _load_posed(ref: SampleRef) -> StereoSample:
     """Read one posed pair, possibly without ground truth; ignores the depth range in camera files."""
     (images, rig), files = _read_pair(ref), ref.files
-    ground_truth, extra = files["truth"], []
+    ground_truth = files["truth"]
+    extra = []
 
     def from_centre(camera: Camera) -> Camera:
         """Return the camera with the centre of its first pixel at 0."""
@@ -309,10 +318,12 @@ def _load_posed(ref: SampleRef) -> StereoSample:
         return replace(camera, K=K)
 
     for view in files["views"][2:]:
-        image, camera = read_rgb(files[f"image {view}"], "further image"), files[f"camera {view}"]
+        image = read_rgb(files[f"image {view}"], "further image")
+        camera = files[f"camera {view}"]
         pose = read_calibration((files["calibration"], camera))
         extra.append(ExtraView(image, from_centre(pose.right).K, pose.E))
-    depth_m, named = np.zeros(images[0].shape[:2], np.float32), f"no {ground_truth}"
+    depth_m = np.zeros(images[0].shape[:2], np.float32)
+    named = f"no {ground_truth}"
     if ground_truth.is_file() or ref.dataset == "robustmvd":
         depth_m = like(images[0], ground_truth, read_map(ground_truth, "ground-truth depth"))
         named = f"{ground_truth.parent.name}/{ground_truth.name}"
@@ -359,7 +370,8 @@ def _load_folder(ref: SampleRef) -> StereoSample:
     depth_m = np.zeros(images[0].shape[:2], np.float32)
     ground_truth = f"no {', '.join(_DEPTHS[:-1])} or {_DEPTHS[-1]} in {ref.files['left'].parent}"
     if path is not None:
-        depth_m, ground_truth = like(images[0], path, read_depth_m(path, "depth")), path.name
+        depth_m = like(images[0], path, read_depth_m(path, "depth"))
+        ground_truth = path.name
     return make_sample(ref, images, rig, depth_m, {"truth": ground_truth})
 
 

@@ -114,7 +114,8 @@ def _set_of(folder: Path) -> str:
 
 def _find(root: Path, name: str) -> list[SampleRef]:
     """Find scene folders with the left view and its disparities; scenes without are the benchmark's test."""
-    edition, refs = EDITIONS[name], []
+    edition = EDITIONS[name]
+    refs = []
     for folder in folders(root, 3):
         left, right = (_image(folder, stem) for stem in edition.views)
         disparity, disparity_right = (_image(folder, stem) for stem in edition.disparities)
@@ -165,7 +166,8 @@ def _load(ref: SampleRef) -> StereoSample:
         grey = read_rgb(files[name], "ground-truth disparity")[..., 0]
         return like(images[0], files[name], grey) / np.float64(scale.grey_per_px)
 
-    disparity, occluded = disparities("disparity"), None
+    disparity = disparities("disparity")
+    occluded = None
     if files["disparity_right"] is not None:
         occluded = (disparity > 0) & occluded_by(disparity, disparities("disparity_right"))
     rig = _rig(size, scale, _offset_px(files["offset"], scale.grey_per_px))
@@ -180,7 +182,9 @@ def _load(ref: SampleRef) -> StereoSample:
 def _rig(size: tuple[int, int], scale: Scale, offset_px: float) -> Rig:
     """Return the rig of a rectified pair whose principal point is the middle of the left image."""
     height, width = size
-    f, cx, cy = scale.focal_px, (width - 1) / 2, (height - 1) / 2
+    f = scale.focal_px
+    cx = (width - 1) / 2
+    cy = (height - 1) / 2
     K = [np.array([[f, 0, c], [0, f, cy], [0, 0, 1.0]]) for c in (cx, cx + offset_px)]
     E = np.eye(4)
     E[0, 3] = scale.baseline_m

@@ -247,12 +247,14 @@ def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: st
         if rng.random() < 0.5:
             shift = -np.cross(turn, (0.0, 0.0, depth_m))
             shift *= min(1.0, fraction * baseline / max(float(np.linalg.norm(shift)), 1e-12))
-        given, moved = E.copy(), E[:3, 3] + E[:3, :3] @ shift
+        given = E.copy()
+        moved = E[:3, 3] + E[:3, :3] @ shift
         given[:3, :3] = E[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
         given[:3, 3] = moved * baseline / np.linalg.norm(moved)
         return given
 
-    E, extra = wrong(sample.E), tuple(view._replace(E=wrong(view.E)) for view in sample.extra_views)
+    E = wrong(sample.E)
+    extra = tuple(view._replace(E=wrong(view.E)) for view in sample.extra_views)
     return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra)
 
 
@@ -271,7 +273,8 @@ def with_scaled_rig(sample: StereoSample, change: Sequence[float], name: str) ->
 
     height, width = sample.right.shape[:2]
     size = round(width * zoom), round(height * zoom)
-    right, camera = sample.right, Camera(sample.K_right, (width, height)).resized(size)
+    right = sample.right
+    camera = Camera(sample.K_right, (width, height)).resized(size)
     if size != (width, height):
         right = cv2.resize(right, size, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC)
     E = scaled(sample.E)

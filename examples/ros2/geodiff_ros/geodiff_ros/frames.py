@@ -86,14 +86,17 @@ class Results:
 
     def messages(self, frame: LiveFrame) -> dict[str, Any]:
         """Return the messages of a frame by topic, all with the header of its left image."""
-        output, header = frame.output.with_holes(self.min_confidence), frame.stamp
-        depth_m, messages = output.prediction[0, ..., 0], {}
+        output = frame.output.with_holes(self.min_confidence)
+        header = frame.stamp
+        depth_m = output.prediction[0, ..., 0]
+        messages = {}
         if output.sigma is not None:
             confidence = frame.output.confidence[0, ..., 0].astype("<f4")
             messages["depth/confidence"] = self._image(header, confidence, "32FC1")
             sigma = sigma_values(output.sigma[0, ..., 0], self.encoding)
             messages["depth/sigma"] = self._image(header, sigma, self.encoding)
-        K, size = np.asarray(output.K)[0].astype(np.float64), (depth_m.shape[1], depth_m.shape[0])
+        K = np.asarray(output.K)[0].astype(np.float64)
+        size = (depth_m.shape[1], depth_m.shape[0])
         return messages | {
             "depth/image": self._image(header, depth_values(depth_m, self.encoding), self.encoding),
             "depth/camera_info": camera_info_message(self.types, header, K, size, self.as_sequence),

@@ -89,7 +89,8 @@ class DepthNode(Node):
 
     def _publish_frames(self) -> None:
         given = self._given
-        device, dtype = pick_device(given["device"]), getattr(torch, given["dtype"])
+        device = pick_device(given["device"])
+        dtype = getattr(torch, given["dtype"])
         pipe = enable_geometry_guidance(load_prior(given["prior"], device, dtype))
         pipe.set_progress_bar_config(disable=True)
         rig = self._source.rig(given["rectified"])
