@@ -64,6 +64,7 @@ IMAGES_AND_OUT = ("left", "right", "view", "out")
 _PAPER, _UNPOSED = Given("preset", "paper"), Given("estimate_pose")
 _RIGHT, _POINTS, _DISPARITY = Given("right"), Given("points"), Given("disparity")
 _OF_SECOND_VIEW = "it applies to a second view"
+_HOLES = Needs(("holes",), (Given("min_confidence"), Given("max_sigma")))
 _FOR_K = "the poses are estimated. To give only K use --K, or --fx --fy --cx --cy"
 _POSED = tuple(name for source in SOURCES for name in source.only_posed)
 _ESTIMATED = tuple(name for source in SOURCES for name in source.only_estimated)
@@ -82,12 +83,14 @@ RULES = (
     Excludes(("temporal_smoothing",), _UNPOSED, "each pair would have its own scale"),
     Needs(("cameras",), (Given("calib"),), "it selects cameras of the calibration file"),
     Excludes(("disparity",), _POINTS, "give one of them"),
-    Needs(("holes",), (Given("min_confidence"), Given("max_sigma"))),
+    _HOLES,
     Excludes(("holes",), Given("fill"), "it fills every pixel"),
     Needs(("points_scale", "points_confidence"), (_POINTS, _DISPARITY)),
     Needs(Parameters.of_second_view, (_RIGHT, _DISPARITY), _OF_SECOND_VIEW),
     Needs((*Matrices.of_second_view, "view", "estimate_pose", "right_mask"), (_RIGHT,), _OF_SECOND_VIEW),
 )
+#: The same of ``geodiff capture``.
+CAPTURE_RULES = (*MACHINE_RULES, _HOLES)
 
 
 def unique_names(paths: Collection[Path]) -> list[str]:
@@ -430,6 +433,12 @@ def start_pair(options: DepthOptions, images: bool = True) -> OutFolder:
     return OutFolder(options.out, inputs=options.read_files(), overwrite=options.overwrite)
 
 
+def _like(record: type, name: str, default: Any, **changes: Any) -> Any:
+    """Declare a setting that another record has as well, with another default and other changes."""
+    declared = next(each for each in dataclasses.fields(record) if each.name == name).metadata["setting"]
+    return dataclasses.field(default=default, metadata={"setting": replace(declared, **changes)})
+
+
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
     """Options of ``geodiff capture``."""
@@ -509,6 +518,15 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
         "(TSDF fusion, needs Open3D); repeatable.",
         choices=("colmap", "mesh", "nerfstudio"),
     )
+    min_confidence: float = _like(
+        DepthOptions,
+        "min_confidence",
+        0.0,
+        help="Minimum confidence of points in clouds and exports, 0 to 1 (at least 0.5 in the fused cloud "
+        "and exports); with --holes of every depth.",
+    )
+    max_sigma: float | None = _like(DepthOptions, "max_sigma", None)
+    holes: bool = _like(DepthOptions, "holes", False)
     poses_only: bool = _output(False, "Only refine the poses, for later runs with --shard.")
     overwrite: bool = _output(False, "Write into a non-empty folder, and recompute finished frames.")
     strict: bool = _output(False, "Exit with code 4 unless every frame is trusted.")
@@ -524,16 +542,10 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
 
     def __post_init__(self) -> None:
         check_settings(self)
-        check_rules(self, MACHINE_RULES)
+        check_rules(self, CAPTURE_RULES)
         given = [f"--{way.replace('_', '-')}" for way in OF_SCALE if getattr(self, way) is not None]
         if len(given) > 1:
             raise_input_error(f"The scale is given more than once ({', '.join(given)}). Give one of them.")
-
-
-def _like(record: type, name: str, default: Any, **changes: Any) -> Any:
-    """Declare a setting that another record has as well, with another default and other changes."""
-    declared = next(each for each in dataclasses.fields(record) if each.name == name).metadata["setting"]
-    return dataclasses.field(default=default, metadata={"setting": replace(declared, **changes)})
 
 
 @dataclass(frozen=True, kw_only=True)
