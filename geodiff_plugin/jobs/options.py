@@ -581,11 +581,26 @@ class LiveOptions(SpeedOptions, RigOptions):
     frames: int | None = setting(None, "Stop after this number of results.", low=1, high=10**9)
     preset: str = _like(RunOptions, "preset", "fast")
     out: Path | None = _output(
-        None, "Output folder: left images, 16-bit depth in millimetres, K.txt and frames.csv.", "--out", "-o"
+        None,
+        "Output folder: left images, depth and its standard deviation in millimetres (16 bits), K.txt and "
+        "frames.csv.",
+        "--out",
+        "-o",
     )
     overwrite: bool = _output(False, "Write into a non-empty folder.")
-    min_confidence: float = _output(
-        0.0, "Minimum confidence of depths in the output folder, 0 to 1; others are 0.", low=0, high=1
+    min_confidence: float = _like(
+        DepthOptions,
+        "min_confidence",
+        0.0,
+        help="Minimum confidence of depths, 0 to 1; others are 0 in every file, message and window.",
+        affects=NOTHING,
+    )
+    max_sigma: float | None = _like(
+        DepthOptions,
+        "max_sigma",
+        None,
+        help="Maximum standard deviation of depths, metres; others are 0, as with --min-confidence.",
+        affects=NOTHING,
     )
     window: bool = _output(False, "Show the left image and the depth in a window (needs opencv-python).")
     quiet: bool = _output(False, "Print only errors and warnings.", "--quiet", "-q")
@@ -595,11 +610,14 @@ class LiveOptions(SpeedOptions, RigOptions):
         """Return the options of ``geodiff depth`` for a frame of the sources, whose names stand for files."""
         left, *rights = map(Path, self.source)
         shared = {
-            name: getattr(self, name) for name in (*settings_of(RigOptions), *settings_of(SpeedOptions))
+            name: getattr(self, name)
+            for name in (
+                *settings_of(RigOptions),
+                *settings_of(SpeedOptions),
+                *("side_by_side", "min_confidence", "max_sigma"),
+            )
         }
-        return DepthOptions(
-            left=left, right=rights[0] if rights else None, side_by_side=self.side_by_side, **shared
-        )
+        return DepthOptions(left=left, right=rights[0] if rights else None, **shared)
 
     def frame_size(self) -> tuple[int, int] | None:
         """Return the ``(width, height)`` of ``--size``."""
@@ -627,7 +645,7 @@ class LiveOptions(SpeedOptions, RigOptions):
             )
         self.frame_size()
         if self.out is None:
-            self.raise_input_error(("overwrite", "min_confidence"), "{} needs --out.")
+            self.raise_input_error(("overwrite",), "{} needs --out.")
         pair = self.as_pair()
         pair.check_all()
         pair.camera_source()

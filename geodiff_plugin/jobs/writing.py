@@ -16,7 +16,7 @@ from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import REPORT, HeldFolder, OutFolder, in_8_bits, read_target_camera, save_png
 from geodiff_plugin.jobs.finished import Row, row_of
 from geodiff_plugin.jobs.memory import fitting_memory
-from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, unique_names
+from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, LiveOptions, unique_names
 from geodiff_plugin.jobs.records import PairInputs, PairResult, PairRun
 from geodiff_plugin.jobs.report import build_report, report_text, single_map, used_poses
 from geodiff_plugin.result.output import MetricDepthOutput
@@ -62,8 +62,8 @@ def write_row(folder: OutFolder | HeldFolder, run: PairRun) -> Row:
     return row_of(write_pair(folder, run).report)
 
 
-def thresholds(options: DepthOptions | CaptureOptions) -> Thresholds:
-    """Return the thresholds of ``MetricDepthOutput.reliable`` for the points of clouds and exports."""
+def thresholds(options: DepthOptions | CaptureOptions | LiveOptions) -> Thresholds:
+    """Return the thresholds of ``MetricDepthOutput.reliable`` in the options of a command."""
     return Thresholds(options.min_confidence, options.max_sigma)
 
 
