@@ -8,7 +8,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from PIL import Image, ImageOps
 
@@ -83,8 +82,45 @@ def _loaded(folder: Path, maps: Mapping[str, str]) -> dict[str, np.ndarray]:
     return {field: np.load(folder / f"{file}.npy") for file, field in maps.items()}
 
 
-def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Check finished frames against overlapping ones, write the result, return pixel fractions."""
+class Thresholds(NamedTuple):
+    """Arguments of ``MetricDepthOutput.reliable``: which depths are reliable."""
+
+    min_confidence: float = 0.0
+    max_sigma: float | None = None  # in the unit of the depth
+
+
+#: Thresholds that every depth passes.
+EVERY_DEPTH = Thresholds()
+
+
+def reliable(frame: DepthFrame, thresholds: Thresholds) -> np.ndarray:
+    """Return the ``(H, W)`` mask of depths that are reliable under the thresholds."""
+    mask: np.ndarray = (frame.depth > 0) & (frame.confidence >= thresholds.min_confidence)
+    if thresholds.max_sigma is not None:
+        assert frame.sigma is not None  # saved with every frame
+        mask &= frame.sigma <= thresholds.max_sigma
+    return mask
+
+
+def with_holes(frame: DepthFrame, thresholds: Thresholds) -> DepthFrame:
+    """Return an agreed frame without the depths that are not reliable.
+
+    All its maps are 0 there, and ``sigma`` is NaN.
+    """
+    mask = reliable(frame, thresholds)
+    names = ("depth", "confidence", "confirmed", "observers")
+    maps: dict[str, Any] = {name: getattr(frame, name) * mask for name in names}
+    assert frame.sigma is not None  # saved with every frame
+    return replace(frame, **maps, sigma=np.where(mask, frame.sigma, np.float32(np.nan)))
+
+
+def write_agreement(
+    capture: Capture, out: Path, names: Sequence[str], holes: Thresholds | None = None
+) -> dict[str, dict[str, float]]:
+    """Check finished frames against overlapping ones, write the result, return pixel fractions.
+
+    With ``holes``, depths that are not reliable after the check are removed.
+    """
     solved = capture.solve()
     number = {name: i for i, name in enumerate(capture.names)}
     available = {number[name] for name in names}
@@ -93,6 +129,7 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
     for name in names:
         others = [load(capture.names[i]) for i in choose_neighbours(solved, number[name], OTHERS, available)]
         frame = agreed(load(name), others)
+        frame = frame if holes is None else with_holes(frame, holes)
         assert frame.confirmed is not None and frame.observers is not None
         _write_agreed(out / name, frame, capture.unit)
         fractions[name] = {
@@ -184,10 +221,12 @@ def write_results(
     export: Sequence[str],
     doubted: Sequence[str],
     original: TransformsFile | None,
+    thresholds: Thresholds = EVERY_DEPTH,
 ) -> dict[str, Any]:
     """Write clouds, a contact sheet that marks ``doubted`` frames, and ``export``; return counts.
 
-    Requires ``write_agreement``. ``original`` is the transforms.json that the capture was read from.
+    Requires ``write_agreement``. ``original`` is the transforms.json that the capture was read from. Clouds
+    and exports have only depths that are reliable under the ``thresholds``.
     """
     unsure = (
         set(doubted) if len(doubted) < len(names) else set()
@@ -195,6 +234,7 @@ def write_results(
 
     def load(name: str) -> DepthFrame:
         frame = _frame(capture, out, AGREED, name)
+        frame = replace(frame, confidence=frame.confidence * reliable(frame, thresholds))
         return replace(frame, observers=np.ones_like(frame.observers)) if name in unsure else frame
 
     cloud, normals = fuse(names, load, capture.image)
@@ -255,24 +295,44 @@ def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
 
 
 def normals_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return ``(H, W, 3)`` unit normals of a depth map in its camera's frame, towards the camera."""
+    """Return ``(H, W, 3)`` unit normals of a depth map in its camera's frame, towards the camera.
+
+    They are 0 without a neighbour of known depth along the row or the column.
+    """
     points = camera.unproject(depth)
-    along = [np.gradient(points, axis=axis) for axis in (0, 1)]
-    normals = np.cross(along[0], along[1])
+    down, across = (_slope(points, depth > 0, axis) for axis in (0, 1))
+    normals = np.cross(down, across)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     away = (normals * points).sum(-1, keepdims=True) > 0
     return np.where(away, -normals, normals).astype(np.float32)
 
 
+def _neighbours(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values ``(H, W, ...)`` of the previous and the next pixel along an axis; 0 outside."""
+    along = np.moveaxis(values, axis, 0)
+    outside = np.zeros_like(along[:1])
+    pair = np.concatenate([outside, along[:-1]]), np.concatenate([along[1:], outside])
+    return np.moveaxis(pair[0], 0, axis), np.moveaxis(pair[1], 0, axis)
+
+
+def _slope(points: np.ndarray, known: np.ndarray, axis: int) -> np.ndarray:
+    """Return the mean difference ``(H, W, 3)`` from points to their known neighbours along an axis."""
+    before, after = _neighbours(points, axis)
+    has_before, has_after = (mask[..., None] for mask in _neighbours(known, axis))
+    total = (points - before) * has_before + (after - points) * has_after
+    slope: np.ndarray = total / np.maximum(has_before.astype(np.float64) + has_after, 1)
+    return slope
+
+
 def kept(frame: DepthFrame) -> np.ndarray:
     """Return the ``(H, W)`` mask of cloud points: confident or confirmed, uncontradicted, not flying.
 
-    Pixels next to unknown depth have no normal.
+    Pixels without a neighbour of known depth along the row or the column have no normal.
     """
-    good = (frame.confidence >= MIN_CONFIDENCE) & ~flying_points(frame.depth)
     known = frame.depth > 0
-    if not known.all():
-        good &= cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    good = known & (frame.confidence >= MIN_CONFIDENCE) & ~flying_points(frame.depth)
+    for axis in (0, 1):
+        good &= np.maximum(*_neighbours(known, axis))
     if frame.confirmed is not None and frame.observers is not None:
         good &= (frame.confirmed > 0) | (frame.observers == 0)
     return good
@@ -303,9 +363,10 @@ def fuse(
 
 
 def _median_depth(frames: Iterable[DepthFrame]) -> float:
-    """Return the median over frames of their median depth, where they have a depth."""
+    """Return the median over frames of their median depth, where they have a depth; 1 if none has."""
     known = (frame.depth[frame.depth > 0] for frame in frames)
-    return float(np.median([np.median(depth) for depth in known if depth.size]))
+    medians = [np.median(depth) for depth in known if depth.size]
+    return float(np.median(medians)) if medians else 1.0
 
 
 def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:
@@ -377,6 +438,8 @@ def write_mesh(
     volume = tensors.VoxelBlockGrid(*kinds, voxel, BLOCK, BLOCKS)
     for frame in map(load, names):
         depth = np.where(kept(frame), frame.depth, 0).astype(np.float32)
+        if not depth.any():  # Open3D rejects a frame without depth
+            continue
         colour = np.ascontiguousarray(image(frame.name), np.float32)
         maps = [tensors.Image(core.Tensor(values)) for values in (depth[..., None], colour)]
         K = core.Tensor(frame.camera.K.astype(np.float64))

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
-from geodiff_plugin.formats import colmap, devices, matlab, named, posed, ros, slam, stereo, transforms
+from geodiff_plugin.formats import (
+    colmap,
+    devices,
+    matlab,
+    named,
+    posed,
+    quest,
+    ros,
+    slam,
+    spatial,
+    stereo,
+    transforms,
+)
 from geodiff_plugin.formats.posed import PosedCameras
 from geodiff_plugin.formats.rigs import CalibrationFormat
 
@@ -65,6 +77,11 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         rf'{devices.RS_PRINTED}|{_json("ppx")}', devices.read_realsense),
     "oak": CalibrationFormat(
         "OAK-D JSON (cameraData)", _json("cameraData"), devices.read_oak, uses_cameras=True),
+    "quest": CalibrationFormat(
+        "pair of QuestRealityCapture's *_camera_mruk_intrinsics.json (lensOffset)",
+        _json("lensOffset", "sensorResolution"), quest.read_quest, (2,)),
+    "spatial_photo": CalibrationFormat(
+        "spatial photo (HEIC with a stereo pair)", _json(spatial.MARK), spatial.read_spatial_photo),
     "nerf": CalibrationFormat(
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
         _json("frames", "transform_matrix"), transforms.read_nerf, by_image=True, as_stored=True),

@@ -13,7 +13,7 @@ import numpy as np
 
 from geodiff_plugin._internal.checks import UnknownFormatError, bad_type, bad_value, check_number, warn
 from geodiff_plugin.findings import Finding
-from geodiff_plugin.formats import colmap, storage
+from geodiff_plugin.formats import colmap, spatial, storage
 from geodiff_plugin.formats.calibrations import CALIBRATION_FORMATS
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, in_units, reading_file
@@ -37,7 +37,9 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
 
 
 def _text(file: Path) -> str:
-    """Return the text of a calibration; converts an archive of matrices to JSON."""
+    """Return the text of a calibration; converts an archive of matrices and a spatial photo to JSON."""
+    if file.suffix.lower() in spatial.SUFFIXES and file.is_file():
+        return spatial.text_of_spatial_photo(file)
     is_npz = file.suffix.lower() == ".npz" and file.is_file()
     return storage.text_of_npz(file) if is_npz else colmap.calibration_text(file)
 

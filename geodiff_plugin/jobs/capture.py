@@ -14,7 +14,7 @@ from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import write_agreement, write_results
 from geodiff_plugin.findings import as_records
 from geodiff_plugin.formats import TRANSFORMS, check_new, locked_folder, transforms_of, write_text
-from geodiff_plugin.jobs.capture_frame import FEWER_PROCESSES
+from geodiff_plugin.jobs.capture_frame import FEWER_PROCESSES, write_agreed_frame
 from geodiff_plugin.jobs.capture_frames import JOURNAL, run_frames
 from geodiff_plugin.jobs.capture_poses import POSES_FILE, RunKeys, open_capture, solved_poses
 from geodiff_plugin.jobs.journal import BROKEN, Record, Shard
@@ -25,6 +25,7 @@ from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.jobs.prior import compile_for
 from geodiff_plugin.jobs.provenance import RECORD, SUMMARY, Provenance, check_poses, prepare_frames
 from geodiff_plugin.jobs.report import plain
+from geodiff_plugin.jobs.writing import thresholds
 from geodiff_plugin.runtime.machine import pick_device
 
 
@@ -116,10 +117,15 @@ def _join_frames(capture: Capture, options: CaptureOptions, names: Sequence[str]
     done = [name for name in names if name not in outcome["failed"]]
     if not done:
         raise InputError(f"All frames failed: {outcome['frames'][0]['error']}")
-    agreement = write_agreement(capture, options.out, done)
+    limits = thresholds(options)
+    agreement = write_agreement(capture, options.out, done, limits if options.holes else None)
     original = transforms_of(options.path, options.images) if capture.kind == TRANSFORMS else None
     doubted = outcome["not_trusted"]
-    files = write_results(capture, options.out, done, options.export, doubted, original)
+    if options.holes:
+        for report in outcome["frames"]:
+            if report["key"] in done:
+                report |= write_agreed_frame(capture, report["frame"], options.out / report["frame"])
+    files = write_results(capture, options.out, done, options.export, doubted, original, limits)
     return {"files": files, "agreement": agreement}
 
 

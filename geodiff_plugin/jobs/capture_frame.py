@@ -13,7 +13,7 @@ import torch
 
 from geodiff_plugin import __version__
 from geodiff_plugin.capture.frames import Capture
-from geodiff_plugin.capture.results import ALONE, save_alone
+from geodiff_plugin.capture.results import ALONE, read_agreed, save_alone
 from geodiff_plugin.findings import as_records
 from geodiff_plugin.formats import MAP_SUFFIXES, REPORT, OutFolder, find_map, read_map, write_text
 from geodiff_plugin.jobs.journal import Item, Record
@@ -21,7 +21,7 @@ from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.jobs.prior import prior_of_capture
 from geodiff_plugin.jobs.report import plain, read_report, single_map, verdict_report
-from geodiff_plugin.jobs.writing import write_maps
+from geodiff_plugin.jobs.writing import thresholds, write_maps, write_previews
 from geodiff_plugin.result.output import MetricDepthOutput
 
 #: Additional hint if memory is insufficient.
@@ -73,14 +73,19 @@ def make_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[], A
 
 
 def _write_frame(capture: Capture, options: CaptureOptions, pipe: Any, item: Item) -> Record:
-    """Write the files and the report of one frame."""
+    """Write the files and the report of one frame.
+
+    ``--holes`` does not apply to the maps that are saved for the agreement check, which raises confidence.
+    """
     name = item.key
     started = time.perf_counter()
     output = depth_of_frame(capture, pipe, name, options, options.points)
-    report = _report(capture, options, item, output)
+    limits = thresholds(options)
+    shown = output.with_holes(*limits) if options.holes else output
+    report = _report(capture, options, item, shown)
 
     def fill(folder: Path) -> None:
-        report["files"] = write_maps(folder, output, capture.image(name))
+        report["files"] = write_maps(folder, shown, capture.image(name), *limits)
         save_alone(folder, *_maps_of(output))
         report["files"]["names"] = [*sorted(path.name for path in folder.iterdir()), REPORT]
         report["seconds"] = round(time.perf_counter() - started, 2)
@@ -95,9 +100,6 @@ def _report(capture: Capture, options: CaptureOptions, item: Item, output: Metri
     """Return the report of one frame without files and seconds."""
     solved = capture.solve()
     number = capture.names.index(item.key)
-    depth_m = single_map(output.prediction)
-    depth_m = depth_m[depth_m > 0] if (depth_m > 0).any() else depth_m
-    low, middle, high = (float(v) for v in np.percentile(depth_m, (2, 50, 98)))
     return {
         "version": __version__,
         "frame": item.key,
@@ -108,11 +110,31 @@ def _report(capture: Capture, options: CaptureOptions, item: Item, output: Metri
         "T_world_from_camera": solved.E[number].tolist(),
         "connected": bool(solved.connected[number]),
         "scale_rel_std": plain(round(solved.scale_rel_std, 4)),
-        "depth": {"p02": low, "median": middle, "p98": high},
+        "depth": _percentiles(single_map(output.prediction)),
         "poses": [pose.status for pose in output.poses],
         "verdict": verdict_report(output),
         "findings": as_records(output.findings),
     }
+
+
+def _percentiles(depth: np.ndarray) -> dict[str, float]:
+    """Return the percentiles of a report of the known depths; 0 if there are none."""
+    known = depth[depth > 0] if (depth > 0).any() else np.zeros(1)
+    low, middle, high = (float(v) for v in np.percentile(known, (2, 50, 98)))
+    return {"p02": low, "median": middle, "p98": high}
+
+
+def write_agreed_frame(capture: Capture, name: str, folder: Path) -> Record:
+    """Write cloud, previews and report of a frame again after the agreement check, with its holes.
+
+    Returns the entries of the report that changed.
+    """
+    depth, confidence, sigma = read_agreed(folder)
+    report = read_report(folder)
+    points = write_previews(folder, capture.image(name), depth, confidence, sigma, report)
+    changed = {"depth": _percentiles(depth), "files": report["files"] | {"cloud_points": points}}
+    write_text(folder / REPORT, json.dumps(report | changed, indent=2) + "\n")
+    return changed
 
 
 def is_made(item: Item, folder: Path) -> bool:

@@ -134,7 +134,7 @@ def known_scale(capture: Capture, options: CaptureOptions, maps_of: MapsOf) -> K
     if options.known_length is None:
         return None if options.metres_per_unit is None else KnownScale(options.metres_per_unit)
     span, length = _known_length(capture, options.known_length)
-    measured, spread = distance_m(*_readings(capture, span, maps_of))
+    measured, spread = distance_m(*_readings(capture, span, *maps_of(span.frame)))
     if not measured > 0:
         bad_value("--known-length", "between two different points", repr(options.known_length))
     relative = math.inf if spread is None else spread / measured
@@ -150,8 +150,7 @@ def _scale_warning(frame: str, relative: float) -> Finding:
     return Finding("capture.length", f"{text}. {hint}")
 
 
-def _readings(capture: Capture, span: Span, maps_of: MapsOf) -> list[Reading]:
-    depth, *further = maps_of(span.frame)
+def _readings(capture: Capture, span: Span, depth: np.ndarray, *further: np.ndarray | None) -> list[Reading]:
     K = capture.camera(span.frame).K
     return [read_pixel(depth, K, (round(x), round(y)), *further) for x, y in span.ends.tolist()]
 
@@ -162,16 +161,17 @@ def measure(
     """Measure distances between pixels in the finished depth of their frames, as records of ``capture.json``.
 
     ``scale_rel_std`` is the relative standard deviation of the capture's scale, ``doubted`` are frames that
-    are not trusted. The standard deviation (``spread``) includes the errors of both depth and scale.
+    are not trusted. The standard deviation (``spread``) includes the errors of both depth and scale. The
+    length is ``None`` if ``--holes`` removed the depth of an end.
     """
-
-    def maps_of(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return read_agreed(out / name)
-
     records = []
     for span in spans:
-        length, spread = distance_m(*_readings(capture, span, maps_of))
-        spread = None if spread is None else math.hypot(spread, length * scale_rel_std)
+        maps = read_agreed(out / span.frame)
+        columns, rows = np.rint(span.ends).astype(int).T
+        length = spread = None
+        if (maps[0][rows, columns] > 0).all():
+            length, spread = distance_m(*_readings(capture, span, *maps))
+            spread = None if spread is None else math.hypot(spread, length * scale_rel_std)
         record = {"frame": span.frame, "pixels": span.taken.tolist(), "length": length, "spread": spread}
         records.append(record | {"unit": capture.unit, "trusted": span.frame not in doubted})
     return records
@@ -180,5 +180,7 @@ def measure(
 def measured_words(record: dict[str, Any]) -> str:
     """Format a measured length for display."""
     ends = " to ".join(f"({x:g}, {y:g})" for x, y in record["pixels"])
+    if record["length"] is None:
+        return f"{record['frame']} {ends}: no reliable depth at an end"
     words = metres(record["length"], record["spread"], record["unit"])
     return f"{record['frame']} {ends}: {words}{'' if record['trusted'] else ' (not trusted)'}"

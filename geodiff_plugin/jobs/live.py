@@ -20,12 +20,14 @@ from geodiff_plugin.formats import (
     raise_unwritable,
     save_png,
     write_depth_mm,
+    write_sigma_mm,
 )
 from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import AUTO, LiveOptions
 from geodiff_plugin.jobs.prior import prior_of_options
 from geodiff_plugin.jobs.reading import read_pair
 from geodiff_plugin.jobs.report import depth_summary, single_map
+from geodiff_plugin.jobs.writing import thresholds
 from geodiff_plugin.plotting import as_rgb_image
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.streaming.loop import LiveFrame, live
@@ -34,7 +36,7 @@ from geodiff_plugin.streaming.sources import CameraSource
 from geodiff_plugin.trust import MatchedFraction
 
 #: Files and folders of the output folder.
-LEFT, DEPTH, INTRINSICS, TABLE = "left", "depth", "K.txt", "frames.csv"
+LEFT, DEPTH, SIGMA, INTRINSICS, TABLE = "left", "depth", "sigma", "K.txt", "frames.csv"
 #: Columns of the table, and of the lines of ``--json``.
 COLUMNS = (
     *("frame", "latency_ms", "near_m", "median_m", "far_m", "confidence"),
@@ -83,7 +85,7 @@ def live_results(
         frames = live(pipe, source, _setup(options, source, notify), **call)
         stack.enter_context(closing(frames))
         for count, frame in enumerate(frames, 1):
-            result = _result(frame, options.min_confidence)
+            result = _result(frame, *thresholds(options))
             if writer is not None:
                 writer.write(result)
             yield result
@@ -106,10 +108,11 @@ def _setup(options: LiveOptions, source: CameraSource, notify: Notify) -> Setup:
     return setup
 
 
-def _result(frame: LiveFrame, min_confidence: float) -> LiveResult:
-    """Summarise a frame."""
+def _result(frame: LiveFrame, min_confidence: float = 0.0, max_sigma: float | None = None) -> LiveResult:
+    """Summarise a frame, without the depths that are not ``reliable`` under the thresholds."""
     output = frame.output
-    depth_m = single_map(output.prediction * output.reliable(min_confidence)).astype(np.float32)
+    reliable = output.reliable(min_confidence, max_sigma)
+    depth_m = single_map(output.prediction * reliable).astype(np.float32)
     depth = depth_summary(depth_m, None)
     matched = output.verdict.facts[MatchedFraction]
     known = {
@@ -144,11 +147,12 @@ class FrameWriter(AbstractContextManager["FrameWriter"]):
 
     def __enter__(self) -> Self:
         try:
-            for name in (LEFT, DEPTH):
+            for name in (LEFT, DEPTH, SIGMA):
                 (self._folder / name).mkdir(parents=True, exist_ok=True)
             self._stack.enter_context(locked_folder(self._folder))
-            for path in [*self._folder.glob(f"{LEFT}/*.png"), *self._folder.glob(f"{DEPTH}/*.png")]:
-                path.unlink()  # of an earlier run
+            for name in (LEFT, DEPTH, SIGMA):
+                for path in self._folder.glob(f"{name}/*.png"):
+                    path.unlink()  # of an earlier run
             file = open(self._folder / TABLE, "w", newline="", encoding="utf-8")  # noqa: SIM115 - closed with the stack
         except OSError as error:
             self._stack.close()
@@ -164,9 +168,13 @@ class FrameWriter(AbstractContextManager["FrameWriter"]):
     def write(self, result: LiveResult) -> None:
         """Write the images of a result, then its row."""
         name = f"{result.frame.number:06d}.png"
+        sigma = result.frame.output.sigma
         try:
             save_png(as_rgb_image(result.frame.left), self._folder / LEFT / name)
             write_depth_mm(self._folder / DEPTH / name, result.depth_m)
+            if sigma is not None:
+                sigma_m = np.where(result.depth_m > 0, single_map(sigma), np.nan)
+                write_sigma_mm(self._folder / SIGMA / name, sigma_m)
             if not (self._folder / INTRINSICS).exists():
                 np.savetxt(self._folder / INTRINSICS, np.asarray(result.frame.output.K)[0])
             self._table.writerow(result.row)

@@ -65,6 +65,7 @@ _PAPER = Given("preset", "paper")
 _UNPOSED = Given("estimate_pose")
 _RIGHT, _POINTS, _DISPARITY = Given("right"), Given("points"), Given("disparity")
 _OF_SECOND_VIEW = "it applies to a second view"
+_HOLES = Needs(("holes",), (Given("min_confidence"), Given("max_sigma")))
 _FOR_K = "the poses are estimated. To give only K use --K, or --fx --fy --cx --cy"
 _POSED = tuple(name for source in SOURCES for name in source.only_posed)
 _ESTIMATED = tuple(name for source in SOURCES for name in source.only_estimated)
@@ -83,12 +84,14 @@ RULES = (
     Excludes(("temporal_smoothing",), _UNPOSED, "each pair would have its own scale"),
     Needs(("cameras",), (Given("calib"),), "it selects cameras of the calibration file"),
     Excludes(("disparity",), _POINTS, "give one of them"),
-    Needs(("holes",), (Given("min_confidence"), Given("max_sigma"))),
+    _HOLES,
     Excludes(("holes",), Given("fill"), "it fills every pixel"),
     Needs(("points_scale", "points_confidence"), (_POINTS, _DISPARITY)),
     Needs(Parameters.of_second_view, (_RIGHT, _DISPARITY), _OF_SECOND_VIEW),
     Needs((*Matrices.of_second_view, "view", "estimate_pose", "right_mask"), (_RIGHT,), _OF_SECOND_VIEW),
 )
+#: The same of ``geodiff capture``.
+CAPTURE_RULES = (*MACHINE_RULES, _HOLES)
 
 
 def unique_names(paths: Collection[Path]) -> list[str]:
@@ -432,6 +435,12 @@ def start_pair(options: DepthOptions, images: bool = True) -> OutFolder:
     return OutFolder(options.out, inputs=options.read_files(), overwrite=options.overwrite)
 
 
+def _like(record: type, name: str, default: Any, **changes: Any) -> Any:
+    """Declare a setting that another record has as well, with another default and other changes."""
+    declared = next(each for each in dataclasses.fields(record) if each.name == name).metadata["setting"]
+    return dataclasses.field(default=default, metadata={"setting": replace(declared, **changes)})
+
+
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
     """Options of ``geodiff capture``."""
@@ -513,6 +522,15 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
         "(TSDF fusion, needs Open3D); repeatable.",
         choices=("colmap", "mesh", "nerfstudio"),
     )
+    min_confidence: float = _like(
+        DepthOptions,
+        "min_confidence",
+        0.0,
+        help="Minimum confidence of points in clouds and exports, 0 to 1 (at least 0.5 in the fused cloud "
+        "and exports); with --holes of every depth.",
+    )
+    max_sigma: float | None = _like(DepthOptions, "max_sigma", None)
+    holes: bool = _like(DepthOptions, "holes", False)
     poses_only: bool = _output(False, "Only refine the poses, for later runs with --shard.")
     overwrite: bool = _output(False, "Write into a non-empty folder, and recompute finished frames.")
     strict: bool = _output(False, "Exit with code 4 unless every frame is trusted.")
@@ -528,16 +546,10 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
 
     def __post_init__(self) -> None:
         check_settings(self)
-        check_rules(self, MACHINE_RULES)
+        check_rules(self, CAPTURE_RULES)
         given = [f"--{way.replace('_', '-')}" for way in OF_SCALE if getattr(self, way) is not None]
         if len(given) > 1:
             raise_input_error(f"The scale is given more than once ({', '.join(given)}). Give one of them.")
-
-
-def _like(record: type, name: str, default: Any, **changes: Any) -> Any:
-    """Declare a setting that another record has as well, with another default and other changes."""
-    declared = next(each for each in dataclasses.fields(record) if each.name == name).metadata["setting"]
-    return dataclasses.field(default=default, metadata={"setting": replace(declared, **changes)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -586,11 +598,26 @@ class LiveOptions(SpeedOptions, RigOptions):
         RigOptions, "right_mask", None, help="Mask of the right images, as --mask."
     )
     out: Path | None = _output(
-        None, "Output folder: left images, 16-bit depth in millimetres, K.txt and frames.csv.", "--out", "-o"
+        None,
+        "Output folder: left images, depth and its standard deviation in millimetres (16 bits), K.txt and "
+        "frames.csv.",
+        "--out",
+        "-o",
     )
     overwrite: bool = _output(False, "Write into a non-empty folder.")
-    min_confidence: float = _output(
-        0.0, "Minimum confidence of depths in the output folder, 0 to 1; others are 0.", low=0, high=1
+    min_confidence: float = _like(
+        DepthOptions,
+        "min_confidence",
+        0.0,
+        help="Minimum confidence of depths, 0 to 1; others are 0 in every file, message and window.",
+        affects=NOTHING,
+    )
+    max_sigma: float | None = _like(
+        DepthOptions,
+        "max_sigma",
+        None,
+        help="Maximum standard deviation of depths, metres; others are 0, as with --min-confidence.",
+        affects=NOTHING,
     )
     window: bool = _output(False, "Show the left image and the depth in a window (needs opencv-python).")
     quiet: bool = _output(False, "Print only errors and warnings.", "--quiet", "-q")
@@ -600,11 +627,14 @@ class LiveOptions(SpeedOptions, RigOptions):
         """Return the options of ``geodiff depth`` for a frame of the sources, whose names stand for files."""
         left, *rights = map(Path, self.source)
         shared = {
-            name: getattr(self, name) for name in (*settings_of(RigOptions), *settings_of(SpeedOptions))
+            name: getattr(self, name)
+            for name in (
+                *settings_of(RigOptions),
+                *settings_of(SpeedOptions),
+                *("side_by_side", "min_confidence", "max_sigma"),
+            )
         }
-        return DepthOptions(
-            left=left, right=rights[0] if rights else None, side_by_side=self.side_by_side, **shared
-        )
+        return DepthOptions(left=left, right=rights[0] if rights else None, **shared)
 
     def frame_size(self) -> tuple[int, int] | None:
         """Return the ``(width, height)`` of ``--size``."""
@@ -632,7 +662,7 @@ class LiveOptions(SpeedOptions, RigOptions):
             )
         self.frame_size()
         if self.out is None:
-            self.raise_input_error(("overwrite", "min_confidence"), "{} needs --out.")
+            self.raise_input_error(("overwrite",), "{} needs --out.")
         pair = self.as_pair()
         pair.check_all()
         pair.camera_source()

@@ -11,11 +11,12 @@ from PIL import Image
 from geodiff_plugin import formats, plotting
 from geodiff_plugin._internal.reprojection import depth_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
+from geodiff_plugin.capture.results import Thresholds
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import REPORT, HeldFolder, OutFolder, in_8_bits, read_target_camera, save_png
 from geodiff_plugin.jobs.finished import Row, row_of
 from geodiff_plugin.jobs.memory import fitting_memory
-from geodiff_plugin.jobs.options import DepthOptions, unique_names
+from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, LiveOptions, unique_names
 from geodiff_plugin.jobs.records import PairInputs, PairResult, PairRun
 from geodiff_plugin.jobs.report import build_report, report_text, single_map, used_poses
 from geodiff_plugin.result.output import MetricDepthOutput
@@ -61,9 +62,9 @@ def write_row(folder: OutFolder | HeldFolder, run: PairRun) -> Row:
     return row_of(write_pair(folder, run).report)
 
 
-def thresholds(options: DepthOptions) -> tuple[float, float | None]:
-    """Return the thresholds of ``MetricDepthOutput.reliable`` for the points of clouds and exports."""
-    return options.min_confidence, options.max_sigma
+def thresholds(options: DepthOptions | CaptureOptions | LiveOptions) -> Thresholds:
+    """Return the thresholds of ``MetricDepthOutput.reliable`` in the options of a command."""
+    return Thresholds(options.min_confidence, options.max_sigma)
 
 
 def write_maps(
@@ -114,6 +115,32 @@ def write_maps(
         "doubtful_points": int((valid & ~reliable).sum()),
         "points_out_of_reach": int((~valid).sum()),
     }
+
+
+def write_previews(
+    folder: Path,
+    left: np.ndarray,
+    depth: np.ndarray,
+    confidence: np.ndarray,
+    sigma: np.ndarray,
+    report: dict[str, Any],
+) -> int:
+    """Write cloud, ``confidence.png`` and ``overview.png`` of changed maps ``(H, W)``; return cloud points.
+
+    ``report`` is the one of the folder.
+    """
+    left = in_8_bits(left)
+    figure = _save_figure(plotting.fraction_figure(confidence, "confidence", 1.0), folder / "confidence.png")
+    error = None
+    if (folder / "visible.png").is_file():
+        visible = np.asarray(Image.open(folder / "visible.png")) > 0
+        error = np.where(visible, np.load(folder / "photometric_error.npy"), np.nan)
+    shown = plotting.shrunk(plotting.depth_figure(depth, unit=report["unit"]))
+    save_png(plotting.overview(left, shown, figure, error), folder / "overview.png")
+    valid = (depth > 0) & ~formats.flying_points(depth)
+    K = np.reshape(report["K"], (3, 3))
+    cloud = folder / "cloud.ply"
+    return formats.write_ply(cloud, depth, left, K, valid=valid, unit=report["unit"], sigma_m=sigma)
 
 
 def _thinned(kept: np.ndarray, max_points: int | None) -> np.ndarray:

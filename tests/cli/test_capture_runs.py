@@ -326,3 +326,36 @@ def test_masked_pixels_get_no_depth_and_no_points_and_another_mask_is_another_ru
     assert answer.code == 2 and "without masks for f00, f01, f02, f03" in answer.err
     answer = geodiff(*typed(scan, "--mask", white, "--overwrite"))
     assert answer.code in (0, 4) and (np.load(scan / "out/f01/depth.npy") > 0).all()
+
+
+def test_holes_are_in_every_file_of_a_capture_and_another_threshold_is_another_run(scan, geodiff):
+    both = ["--frames", "f01,f02", "--overwrite"]
+    assert geodiff(*typed(scan, *both)).code in (0, 4)
+    names = ("f01", "f02")
+    files = ("depth", "confidence", "sigma")
+    whole = {name: [np.load(scan / f"out/{name}/{file}.npy") for file in files] for name in names}
+    most = np.median(np.stack([sigma for _, _, sigma in whole.values()]))
+    thresholds = ["--min-confidence", 0.3, "--max-sigma", most]
+    answer = geodiff(*typed(scan, *both, *thresholds, "--holes", "--export", "nerfstudio"))
+    assert answer.code in (0, 4), answer.err
+    for name in names:
+        folder, (depth, confidence, sigma) = scan / "out" / name, whole[name]
+        mask = (confidence >= 0.3) & (sigma <= most)
+        assert 0.1 < mask.mean() < 0.9
+        np.testing.assert_array_equal(np.load(folder / "depth.npy"), np.where(mask, depth, 0))
+        for image in ("depth_mm.png", "sigma_mm.png"):
+            assert not np.asarray(Image.open(folder / image))[~mask].any()
+        units = np.asarray(Image.open(scan / f"out/nerfstudio/depths/{name}.png"))
+        assert (units > 0).sum() > 100 and not units[~mask].any()
+        report = json.loads((folder / "report.json").read_text())
+        assert report["depth"]["median"] == pytest.approx(np.median(depth[mask]))
+        points = len(trimesh.load(folder / "cloud.ply").vertices)
+        assert 0.9 * mask.sum() < points == report["files"]["cloud_points"] <= mask.sum()
+        assert (folder / "overview.png").stat().st_mtime_ns > (folder / "depth_alone.npy").stat().st_mtime_ns
+    assert len(trimesh.load(scan / "out/cloud.ply").vertices) > 100
+    shown = json.loads((scan / "out/capture.json").read_text())["frames"][1]
+    assert shown["depth"] == report["depth"] and shown["files"] == report["files"]
+    answer = geodiff(*typed(scan, "--min-confidence", 0.4, "--max-sigma", most, "--holes"))
+    assert answer.code == 2 and "made with --min-confidence 0.3 instead of 0.4" in answer.err
+    answer = geodiff(*typed(scan, "--holes"))
+    assert answer.code == 2 and "--holes needs --min-confidence or --max-sigma" in answer.err

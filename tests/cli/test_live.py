@@ -27,10 +27,21 @@ def test_a_recorded_video(geodiff, rig, textured_plane):
     first, *_, last = answer.out.splitlines()
     assert first.startswith("frame 0: latency ") and " m, median " in first
     assert last.startswith("4 frames, 0 skipped, ") and " frames/s; latency " in last
-    assert sorted(path.name for path in Path("out").iterdir()) == ["K.txt", "depth", "frames.csv", "left"]
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        *("K.txt", "depth", "frames.csv", "left", "sigma")
+    ]
     depth_m = cv2.imread("out/depth/000003.png", cv2.IMREAD_UNCHANGED) / 1000
     assert depth_m.shape == textured_plane.left.shape[:2]
     assert np.median(np.abs(depth_m / textured_plane.depth_m - 1)) < 0.05
+    sigma_m = cv2.imread("out/sigma/000003.png", cv2.IMREAD_UNCHANGED) / 1000
+    most = float(np.median(sigma_m))
+    answer = geodiff(*rig, "--frames", 1, "--out", "holes", "--max-sigma", most, "--min-confidence", 0.1)
+    assert answer.code == 0, answer.err
+    holed, sigma = (
+        cv2.imread(f"holes/{name}/000000.png", cv2.IMREAD_UNCHANGED) for name in ("depth", "sigma")
+    )
+    assert 0.1 < (holed > 0).mean() < 0.9 and sigma.max() <= np.ceil(1000 * most)
+    np.testing.assert_array_equal(holed > 0, sigma > 0)
 
 
 def test_a_line_of_json_per_result(geodiff, rig):

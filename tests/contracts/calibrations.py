@@ -619,6 +619,44 @@ def booster(rig: Drawn) -> tuple[str, ...]:
     return (f'<?xml version="1.0"?>\n<opencv_storage>\n{matrices}{baseline}</opencv_storage>\n',)
 
 
+def quest(rig: Drawn) -> tuple[str, ...]:
+    """MrukIntrinsicsMetadata of QuestRealityCapture: the images are the middle of a larger sensor, halved.
+
+    Unity's camera sees X right, Y up and Z forward; rows of the sensor are counted from the bottom.
+    """
+    texts, (width, height) = [], rig.size
+    for side, name in enumerate(("Left", "Right")):
+        fx, fy, cx, cy = rig.numbers(side)
+        head = np.linalg.inv(rig.worlds[side])
+        right, down, forward = head[:3, :3].T
+        axes = np.stack([right, -down, forward], -1) * [[1], [-1], [1]]
+        x, y, z, w = map(float, Rotation.from_matrix(axes).as_quat())
+        place = dict(zip("xyz", map(float, head[:3, 3] * [1, -1, 1]), strict=True))
+        from_bottom = 2 * (height - 0.5 - cy) + (3 * height - 2 * height) / 2
+        entries = {
+            **{"backend": "MRUK", "cameraPosition": name, "imageFormat": "RGBA32"},
+            "focalLength": {"x": 2 * fx, "y": 2 * fy},
+            "principalPoint": {"x": 2 * (cx + 0.5), "y": from_bottom},
+            "resolution": {"width": width, "height": height},
+            "sensorResolution": {"width": 2 * width, "height": 3 * height},
+            "currentResolution": {"width": width, "height": height},
+            "lensOffset": {"position": place, "rotation": {"x": x, "y": y, "z": z, "w": w}},
+            "error": "",
+        }
+        texts.append(json.dumps(entries, indent=4))
+    return tuple(texts)
+
+
+def spatial_photo(rig: Drawn) -> tuple[str, ...]:
+    """What is read of a HEIC file; pixels are counted from the corner of the first one."""
+    cameras = []
+    for side, x_um in enumerate((0, float(-1e6 * rig.T[0, 3]))):
+        fx, fy, cx, cy = rig.numbers(side)
+        entries = {"size": list(rig.size), "focal": [fx, fy], "centre": [cx + 0.5, cy + 0.5], "x_um": x_um}
+        cameras.append(entries)
+    return (json.dumps({"spatial_photo": cameras}),)
+
+
 def stereodemo(rig: Drawn) -> tuple[str, ...]:
     fx, fy, cx, cy = rig.numbers(0)
     entries = {"fx": fx, "fy": fy, "cx0": cx, "cx1": rig.numbers(1)[2], "cy": cy}
@@ -651,7 +689,7 @@ def ros_echo(rig: Drawn) -> tuple[str, ...]:
 #: Formats of any pose and of rectified pairs, and those with one camera for both images: the function's name
 #: begins with that of the format.
 ANY_POSE = (
-    *(opencv, kalibr, euroc, orb_slam, mvsnet, zed, realsense, realsense_printed, oak, colmap, nerf),
+    *(opencv, kalibr, euroc, orb_slam, mvsnet, zed, realsense, realsense_printed, oak, quest, colmap, nerf),
     *(kalibr_fisheye, orb_slam_fisheye, kalibr_openvins, kalibr_cam_imu, basalt, basalt_fisheye),
     *(vins, vins_fisheye, matlab, matlab_pose, named, named_by_side),
     *(okvis, okvis_fisheye, svo, svo_inverse, svo_fisheye, airslam, airslam_fisheye),
@@ -661,7 +699,7 @@ ANY_POSE = (
 )
 RECTIFIED = (
     *(middlebury, middlebury_blanks, kitti_cam_to_cam, kitti_projections, booster, stereodemo, ros, ros_echo),
-    *(opencv_projections, vkitti, argoverse, ros_ini, robotcar),
+    *(opencv_projections, vkitti, argoverse, ros_ini, robotcar, spatial_photo),
 )
 ONE_CAMERA = (stella, stvo_rectified, foundation_stereo, orb_slam_rectified, cityscapes, spring, sceneflow)
 

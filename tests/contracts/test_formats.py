@@ -53,7 +53,7 @@ def test_a_rig_of_any_pose_is_read_as_it_was_written(tmp_path, write, drawn):
     rig = of.read_texts(tmp_path, *write(drawn), distorted=True, **choices)
     check(rig, drawn, None if write in (of.mvsnet, of.bouguet) else choices.get("image_size", drawn.size))
     assert not rig.rectified or write in (of.realsense, of.realsense_printed)
-    kind = None if write is of.mvsnet else "fisheye" if "fisheye" in write.__name__ else "opencv"
+    kind = None if write in (of.mvsnet, of.quest) else "fisheye" if "fisheye" in write.__name__ else "opencv"
     for lens, expected in zip(lenses_of(rig) if kind else (), drawn.lenses, strict=bool(kind)):
         numbers = lens.coefficients.tolist()
         assert lens.model == kind and numbers[:4] == expected and not any(numbers[4:])
@@ -66,7 +66,10 @@ def test_a_rectified_rig_is_read_as_it_was_written(tmp_path, write, drawn):
     rig = of.read_texts(tmp_path, *write(drawn), distorted=True, **choice(write.__name__))
     without_size = (of.kitti_projections, of.booster, of.vkitti, of.argoverse, of.robotcar)
     check(rig, drawn, None if write in without_size else drawn.size)
-    assert rig.rectified == (write is not of.stereodemo) and lenses_of(rig) == (None, None)
+    assert rig.rectified == (write not in (of.stereodemo, of.spatial_photo)) and lenses_of(rig) == (
+        None,
+        None,
+    )
 
 
 @pytest.mark.parametrize("sample", SAMPLES)

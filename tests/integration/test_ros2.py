@@ -111,13 +111,16 @@ def test_results_become_messages(frames, source, pipe, textured_plane, encoding)
     results.close()
     confidence = frame.output.confidence[0, ..., 0]
     limit = float(np.median(confidence))
-    make = frames.Results(STORE.types, encoding, limit, as_level=lambda level: level[0])
+    most = float(np.nanquantile(frame.output.sigma, 0.3))
+    make = frames.Results(STORE.types, encoding, limit, most, as_level=lambda level: level[0])
     messages = {topic: sent(message) for topic, message in make.messages(frame).items()}
     topics = ["/diagnostics", *(f"depth/{name}" for name in ("camera_info", "confidence", "image", "sigma"))]
     assert sorted(messages) == topics
     for message in messages.values():
         assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1, 7)
-    expected = np.where((confidence >= limit) & (confidence > 0), frame.output.prediction[0, ..., 0], np.nan)
+    reliable = (confidence >= limit) & (confidence > 0) & (frame.output.sigma[0, ..., 0] <= most)
+    assert reliable.sum() < ((confidence >= limit) & (confidence > 0)).sum()
+    expected = np.where(reliable, frame.output.prediction[0, ..., 0], np.nan)
     depth = read(messages["depth/image"])
     if encoding == "32FC1":
         np.testing.assert_allclose(depth, expected, rtol=1e-6)
@@ -234,6 +237,10 @@ def test_the_node_publishes_the_depth_of_its_topics(node, textured_plane):
     assert type(depth).__name__ == "Image" and depth.encoding == "16UC1" and depth.data.typecode == "B"
     depth_m = np.frombuffer(depth.data, "<u2").reshape(depth.height, depth.width) / 1000
     assert np.median(np.abs(depth_m / textured_plane.depth_m - 1)) < 0.05
+    sigma = messages["depth/sigma"]
+    assert type(sigma).__name__ == "Image" and sigma.encoding == "16UC1"
+    sigma_m = np.frombuffer(sigma.data, "<u2").reshape(depth_m.shape) / 1000
+    np.testing.assert_array_equal(sigma_m > 0, depth_m > 0)
     assert messages["depth/camera_info"].d.typecode == "d"
     assert messages["/diagnostics"].status[0].level in (b"\0", b"\1")
 

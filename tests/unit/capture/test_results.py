@@ -17,7 +17,15 @@ from geodiff_plugin.cameras import Camera
 from geodiff_plugin.capture import results
 from geodiff_plugin.capture.agreement import agreed
 from geodiff_plugin.capture.frames import choose_neighbours
-from geodiff_plugin.capture.results import FinishedFrame, fuse, kept, normals_of, write_map, write_mesh
+from geodiff_plugin.capture.results import (
+    FinishedFrame,
+    Thresholds,
+    fuse,
+    kept,
+    normals_of,
+    write_map,
+    write_mesh,
+)
 from geodiff_plugin.formats.clouds import flying_points
 from geodiff_plugin.pose.multiview import SolvedCapture
 from geodiff_plugin.types import DepthFrame
@@ -36,6 +44,24 @@ def test_normals_of_a_plane_are_its_own_towards_the_camera():
         found = normals_of((-2.5 * np.linalg.norm(normal) / (rays @ normal)).astype(np.float64), Camera(K))
         assert found.dtype == np.float32 and found.shape == (22, 17, 3)
         np.testing.assert_allclose(found, np.broadcast_to(unit, found.shape), atol=1e-5)
+
+
+def test_normals_and_points_reach_up_to_unknown_depth():
+    """Only a pixel without a known neighbour along its row or its column has none."""
+    v, u = np.mgrid[:22, :17]
+    normal = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    depth = -2.5 / (rays @ normal)
+    depth[10:14, 4:9] = 0
+    depth[:4, 12:] = 0
+    depth[1, 14] = -2.5 / (rays @ normal)[1, 14]  # alone
+    known = depth > 0
+    known[1, 14] = False
+    found = normals_of(depth, Camera(K))
+    np.testing.assert_allclose(found[known], np.broadcast_to(normal, found.shape)[known], atol=1e-5)
+    assert not found[1, 14].any()
+    frame = posed_frame("", depth.astype(np.float32), np.ones_like(depth), K, np.eye(4))
+    np.testing.assert_array_equal(kept(frame), known & ~flying_points(depth))
 
 
 def test_kept_pixels_are_sure_or_confirmed_and_never_contradicted_nor_flying():
@@ -490,6 +516,75 @@ def test_exports_are_written_on_demand_from_the_agreed_frames(finished, plain_fi
         np.testing.assert_allclose(units[use], 1000 * maps[0][use], atol=0.51)
         depth = read_colmap_map(out / "colmap/stereo/depth_maps" / f"{name}.png.geometric.bin")
         np.testing.assert_array_equal(depth, np.where(use, maps[0], 0))
+
+
+THRESHOLDS = Thresholds(0.6, 0.3)
+OF_A_FRAME = ("depth", "confidence", "sigma", "confirmed", "observers")
+
+
+def maps_of(out, name: str) -> list[np.ndarray]:
+    return [np.load(out / name / f"{file}.npy") for file in OF_A_FRAME]
+
+
+def test_holes_are_where_the_agreed_depth_is_not_reliable(finished, plain_figures, tmp_path):
+    """A depth that others confirm is kept, although its frame alone was not sure of it."""
+    out = tmp_path / "out"
+    whole_fractions = results.write_agreement(finished, out, NAMES)
+    whole = {name: maps_of(out, name) for name in NAMES}
+    fractions = results.write_agreement(finished, out, NAMES, THRESHOLDS)
+    rescued = 0
+    for number, name in enumerate(NAMES):
+        depth, confidence, sigma, *counts = whole[name]
+        mask = (confidence >= 0.6) & (sigma <= 0.3)
+        assert 0.1 < mask.mean() < 0.9
+        rescued += (mask & (alone(out, number).confidence < 0.6)).sum()
+        found = maps_of(out, name)
+        for values, before in zip(found, (depth, confidence, None, *counts), strict=True):
+            if before is not None:
+                np.testing.assert_array_equal(values, np.where(mask, before, 0))
+        np.testing.assert_array_equal(found[2], np.where(mask, sigma, np.nan))
+        for file in ("depth_mm.png", "sigma_mm.png"):
+            assert not np.asarray(Image.open(out / name / file))[~mask].any()
+        assert fractions[name]["confirmed"] < whole_fractions[name]["confirmed"]
+        assert [values.dtype for values in found] == [values.dtype for values in whole[name]]
+    assert rescued > 100
+
+
+def in_frame(points: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of points in a frame, for those inside."""
+    seen = (points - ES[number][:3, 3]) @ ES[number][:3, :3] @ KS[number].T
+    column, row = np.rint(seen[:, :2] / seen[:, 2:]).astype(int).T
+    width, height = SIZES[number]
+    inside = (seen[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    return row[inside], column[inside]
+
+
+@pytest.mark.parametrize("holes", [None, THRESHOLDS])
+def test_clouds_and_exports_have_reliable_depths_only(holes, finished, plain_figures, tmp_path):
+    out = tmp_path / "out"
+    results.write_agreement(finished, out, ["b"], holes)
+    exports = ("colmap", "nerfstudio")
+    every = results.write_results(finished, out, ["b"], exports, [], None)["cloud_points"]
+    counts = results.write_results(finished, out, ["b"], exports, [], None, THRESHOLDS)
+    assert counts["cloud_points"] > 100 and (counts["cloud_points"] < every or holes is not None)
+    depth, confidence, sigma, *_ = maps_of(out, "b")
+    mask = (confidence >= 0.6) & (sigma <= 0.3)
+    number = NAMES.index("b")
+    at = in_frame(trimesh.load(out / "cloud.ply", process=False).vertices, number)
+    assert len(at[0]) > 100 and mask[at].mean() > 0.9  # a point is the mean of a cell
+    written_depth = read_colmap_map(out / "colmap/stereo/depth_maps/b.png.geometric.bin")
+    units = np.asarray(Image.open(out / "nerfstudio/depths/b.png"))
+    for values in (written_depth, units):
+        assert (values > 0).sum() > 100 and not values[~mask].any()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_capture_without_any_reliable_depth_has_an_empty_cloud(finished, plain_figures, tmp_path):
+    out, none = tmp_path / "out", Thresholds(max_sigma=1e-6)
+    results.write_agreement(finished, out, NAMES, none)
+    exports = ("colmap", "nerfstudio")
+    assert results.write_results(finished, out, NAMES, exports, [], None, none) == {"cloud_points": 0}
+    assert not np.load(out / "b/depth.npy").any() and (out / "sheet.jpg").is_file()
 
 
 def test_the_sheet_has_every_frame_and_its_depth_and_marks_those_that_are_not_trusted(

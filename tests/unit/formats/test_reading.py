@@ -22,7 +22,7 @@ from tests.unit.formats.calibrated_pair import (
 from tests.views import lenses_of
 
 #: Formats with one file per camera, and formats with a varying number of files.
-OF_TWO_FILES = {"robotcar", "vkitti", "mvsnet", "mrcal", "euroc", "ros", "colmap"}
+OF_TWO_FILES = {"robotcar", "vkitti", "mvsnet", "mrcal", "euroc", "quest", "ros", "colmap"}
 OF_SEVERAL = {"ros_ini": (1, 2), "opencv": (1, 2, 3), "named": (1, 2, 3)}
 #: Formats that may contain more than two cameras.
 OF_MANY_CAMERAS = {

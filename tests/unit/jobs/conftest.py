@@ -67,15 +67,22 @@ def run(capture, tmp_path, solving, monkeypatch):
         capture_frame, "write_maps", lambda *given: asked.__dict__.update(maps=given) or {"n": 1}
     )
     monkeypatch.setattr(whole, "compile_for", lambda *given: None)
-    asked.agreed = []
-    monkeypatch.setattr(
-        whole, "write_agreement", lambda found, out, names: asked.agreed.append(names) or {"share": 1}
-    )
+    asked.agreed, asked.holes = [], []
 
-    def write_results(found, out, names, export, doubted, original):
-        asked.results = (names, export, doubted, original)
+    def write_agreement(found, out, names, holes):
+        asked.agreed.append(names)
+        asked.holes.append(holes)
+        return {"share": 1}
+
+    monkeypatch.setattr(whole, "write_agreement", write_agreement)
+
+    def write_results(found, out, names, export, doubted, original, thresholds):
+        asked.results, asked.thresholds = (names, export, doubted, original), thresholds
         return {"cloud.ply": 3}
 
     monkeypatch.setattr(whole, "write_results", write_results)
+    monkeypatch.setattr(
+        whole, "write_agreed_frame", lambda found, name, folder: asked.holes.append(name) or {"agreed": name}
+    )
     asked.folder = tmp_path
     return asked

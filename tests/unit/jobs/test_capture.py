@@ -103,6 +103,30 @@ def test_every_frame_has_a_folder_with_its_maps_and_report(run):
 
 
 @pytest.mark.filterwarnings("ignore:The scale is uncertain")
+def test_holes_are_in_the_report_and_files_of_a_frame_but_not_in_the_maps_to_be_compared(run):
+    given = options(run.folder, processes=1, frames="f1", min_confidence=0.6, max_sigma=0.9)
+    output = made_runs.output(unit=None)
+    assert depth_capture(given)["frames"][0]["depth"]["median"] == pytest.approx(
+        np.median(made_runs.depth_map()[made_runs.depth_map() > 0])
+    )
+    assert run.holes == [None] and run.thresholds == (0.6, 0.9) and run.maps[3:] == (0.6, 0.9)
+    np.testing.assert_array_equal(run.maps[1].prediction, output.prediction)
+    with pytest.raises(InputError, match="made with --holes False instead of True"):
+        depth_capture(replace(given, holes=True))
+    report = depth_capture(replace(given, holes=True, overwrite=True))
+    kept = output.reliable(0.6, 0.9)
+    assert 0.1 < kept.mean() < 0.9 and run.holes[1:] == [(0.6, 0.9), "f1"] and run.thresholds == (0.6, 0.9)
+    assert report["frames"][0]["agreed"] == "f1"
+    np.testing.assert_array_equal(run.maps[1].prediction, output.prediction * kept)
+    low, middle, high = np.percentile(output.prediction[kept], (2, 50, 98))
+    assert report["frames"][0]["depth"] == pytest.approx({"p02": low, "median": middle, "p98": high})
+    alone = np.load(run.folder / "out/f1/depth_alone.npy")
+    np.testing.assert_array_equal(alone, made_runs.depth_map())
+    with pytest.raises(InputError, match=r"made with --max-sigma 0\.9 instead of 0\.2"):
+        depth_capture(replace(given, holes=True, max_sigma=0.2))
+
+
+@pytest.mark.filterwarnings("ignore:The scale is uncertain")
 def test_a_failed_frame_is_left_out_and_the_frames_that_are_chosen_are_made(run):
     run.fails = {"f1"}
     report = depth_capture(options(run.folder, processes=1, frames="f1,f2"))

@@ -171,6 +171,18 @@ def test_lengths_are_measured_in_the_finished_maps_with_both_spreads(capture, tm
     assert measured_words(record | {"spread": None, "trusted": False}).endswith(" (not trusted)")
 
 
+def test_an_end_in_a_hole_has_no_length(capture, tmp_path):
+    (tmp_path / "f0").mkdir()
+    depth = depth_of("f0").copy()
+    depth[40, 58] = 0
+    for name, values in (("depth", depth), ("confidence", confidence_of("f0")), ("sigma", sigma_of("f0"))):
+        np.save(tmp_path / f"f0/{name}.npy", values)
+    typed = options(measure=("f0:40,3,58,40", "f0:40,3,50,40"))
+    hole, other = measure(capture, spans_to_measure(capture, typed), tmp_path, [], 0.0)
+    assert (hole["length"], hole["spread"]) == (None, None) and other["length"] > 0
+    assert measured_words(hole) == "f0 (40, 3) to (58, 40): no reliable depth at an end"
+
+
 @pytest.mark.parametrize(
     "typed",
     [

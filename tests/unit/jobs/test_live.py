@@ -52,6 +52,11 @@ def test_every_frame_of_a_video_and_its_folder(options, textured_plane, pipe):
         np.testing.assert_array_equal(left, textured_plane.left)
         depth_m, _ = read_depth_png(f"out/depth/{number:06d}.png")
         np.testing.assert_allclose(depth_m, np.where(result.depth_m < 65.5, result.depth_m, 0), atol=6e-4)
+        sigma, near = result.frame.output.sigma[0, ..., 0], result.depth_m > 0
+        sigma_mm = cv2.imread(f"out/sigma/{number:06d}.png", cv2.IMREAD_UNCHANGED)
+        assert sigma_mm.dtype == np.uint16 and not sigma_mm[~near].any()
+        above = sigma_mm[near] - 1000.0 * sigma[near]
+        assert above.min() > -0.01 and above.max() < 1.01
         assert float(rows[number]["median_m"]) == pytest.approx(np.median(depth_m[depth_m > 0]), abs=2e-3)
 
 
@@ -86,12 +91,27 @@ def test_a_folder_is_replaced_only_with_overwrite(options, pipe):
     assert [path.name for path in sorted(Path("out/depth").iterdir())] == ["000000.png"]
 
 
-def test_depths_of_low_confidence_are_holes_in_the_folder(options, pipe):
+def test_depths_that_are_not_reliable_are_holes_in_files_and_rows(options, pipe):
     (plain,) = results_of(replace(options, frames=1), pipe=pipe)
-    limit = float(np.median(plain.frame.output.confidence))
-    (sure,) = results_of(replace(options, frames=1, out=Path("out"), min_confidence=limit), pipe=pipe)
-    confidence = plain.frame.output.confidence[0, ..., 0]
-    np.testing.assert_array_equal(sure.depth_m, np.where(confidence >= limit, plain.depth_m, 0))
+    confidence, sigma = (getattr(plain.frame.output, name)[0, ..., 0] for name in ("confidence", "sigma"))
+    limit, most = float(np.quantile(confidence, 0.3)), float(np.nanquantile(sigma, 0.7))
+    thresholds = {"min_confidence": limit, "max_sigma": most}
+    (sure,) = results_of(replace(options, frames=1, out=Path("out"), **thresholds), pipe=pipe)
+    kept = (confidence >= limit) & (sigma <= most) & (plain.depth_m > 0)
+    assert 0.2 < kept.mean() < 0.9
+    np.testing.assert_array_equal(sure.depth_m, np.where(kept, plain.depth_m, 0))
+    assert sure.row["median_m"] == pytest.approx(np.median(plain.depth_m[kept]), abs=1e-3)
+    for name in ("depth", "sigma"):
+        image = cv2.imread(f"out/{name}/000000.png", cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(image > 0, kept)
+
+
+def test_a_preset_without_confidence_has_no_sigma_and_no_thresholds(options, pipe):
+    options = replace(options, parameter=("refine_edges=false",), frames=1, out=Path("out"))
+    results_of(options, pipe=pipe)
+    assert Path("out/depth/000000.png").is_file() and not list(Path("out/sigma").iterdir())
+    with pytest.raises(InputError, match="--max-sigma needs a confidence"):
+        results_of(replace(options, overwrite=True, max_sigma=0.1), pipe=pipe)
 
 
 def test_assumptions_about_the_cameras_are_reported_once(options, textured_plane, pipe):
@@ -115,7 +135,7 @@ def test_assumptions_about_the_cameras_are_reported_once(options, textured_plane
         ({"calib": ()}, "The cameras are missing"),
         ({"calib": (Path("none.txt"),)}, "none.txt"),
         ({"overwrite": True}, "--overwrite needs --out"),
-        ({"min_confidence": 0.5}, "--min-confidence needs --out"),
+        ({"max_sigma": 0.0}, "--max-sigma must be a finite number of metres above 0"),
         ({"near": 3.0, "far": 2.0}, "--near"),
         ({"parameter": ("nothing=1",)}, "nothing"),
         ({"source": ("none.mp4",)}, "none.mp4"),

@@ -61,7 +61,7 @@ RANGES = {
     "workers": (1, 10**6, True),
     "gpus": (0, 64, False),
 }
-RANGES_OF_CAPTURES = {name: RANGES[name] for name in ("steps", "seed", "workers", "gpus")}
+RANGES_OF_CAPTURES = {name: RANGES[name] for name in ("steps", "seed", "workers", "gpus", "min_confidence")}
 RANGES_OF_CAPTURES |= {"neighbours": (1, 32, True), "processes": (1, 1024, True)}
 
 
@@ -316,6 +316,8 @@ def test_the_scale_of_a_capture_is_given_in_one_way_and_ray_has_its_options():
         ({"gpus": 1.0}, "--gpus needs --engine ray"),
         (RAY | {"shard": "0/2"}, "--shard cannot be used with --engine ray"),
         ({"poses": "solved"}, "--poses must be one of"),
+        ({"holes": True}, "--holes needs --min-confidence or --max-sigma"),
+        ({"min_confidence": 1.1}, "--min-confidence must be between 0 and 1"),
     ):
         with pytest.raises(InputError, match=said):
             CaptureOptions(path=LEFT, **given)

@@ -74,6 +74,7 @@ class Results:
         types: message classes by full name.
         encoding: ``"32FC1"`` or ``"16UC1"``.
         min_confidence: depths with a lower confidence are unknown.
+        max_sigma: depths with a larger standard deviation, metres, are unknown; 0 for any.
         as_sequence: converts an array to the type of a message's sequences.
         as_level: converts a level of ``DiagnosticStatus`` to the type of its field.
     """
@@ -81,12 +82,13 @@ class Results:
     types: Types
     encoding: str = "32FC1"
     min_confidence: float = 0.0
+    max_sigma: float = 0.0
     as_sequence: AsSequence = np.asarray
     as_level: Callable[[bytes], Any] = bytes
 
     def messages(self, frame: LiveFrame) -> dict[str, Any]:
         """Return the messages of a frame by topic, all with the header of its left image."""
-        output = frame.output.with_holes(self.min_confidence)
+        output = frame.output.with_holes(self.min_confidence, self.max_sigma or None)
         header = frame.stamp
         depth_m = output.prediction[0, ..., 0]
         messages = {}

@@ -40,6 +40,7 @@ PARAMETERS: dict[str, Any] = {
     "check_every": 100,
     "encoding": "32FC1",
     "min_confidence": 0.0,
+    "max_sigma": 0.0,
     "rectified": True,
     "slop": 0.005,
 }
@@ -66,7 +67,8 @@ class DepthNode(Node):
         super().__init__("geodiff_depth")
         self._given = {name: self.declare_parameter(name, value).value for name, value in PARAMETERS.items()}
         self._source = MessageSource()
-        self._results = Results(TYPES, self._given["encoding"], self._given["min_confidence"], as_sequence)
+        given = {name: self._given[name] for name in ("encoding", "min_confidence", "max_sigma")}
+        self._results = Results(TYPES, **given, as_sequence=as_sequence)
         self._outputs = {topic: self.create_publisher(kind, topic, QUEUE) for topic, kind in OUTPUTS.items()}
         quality = {"qos_profile": qos_profile_sensor_data}
         for side in ("left", "right"):
