@@ -149,15 +149,15 @@ _KINDS = (
         "image.dark",
         WARNING,
         "A 16-bit image is nearly black",
-        cause="The camera has 10 or 12 bits, and its values were stored without scaling.",
+        cause="The camera records 10 or 12 bits, and the values were stored without scaling to 16 bits.",
         hint="Multiply the values by 64 (10 bits) or 16 (12 bits).",
     ),
     FindingKind(
         "image.bits",
         WARNING,
         "16-bit images of a bag are interpreted as 10, 12 or 14 bits",
-        cause="The camera has 10, 12 or 14 bits, and its driver stores the values without scaling.",
-        hint="Ignore the warning, unless the camera has 16 bits and the scene was dark.",
+        cause="The camera records 10, 12 or 14 bits, and its driver stores the values without scaling.",
+        hint="Ignore the warning, unless the camera records 16 bits and the scene was dark.",
     ),
     FindingKind(
         "image.alpha",
@@ -197,14 +197,14 @@ _KINDS = (
     FindingKind(
         "camera.from-fov",
         ASSUMPTION,
-        "The field of view is the one entered in the web app",
+        "The field of view was entered in the web app",
         cause="The image files have no EXIF focal length.",
         hint="Use images with EXIF data, or calibrate the camera.",
     ),
     FindingKind(
         "camera.assumed-intrinsics",
         ASSUMPTION,
-        "Missing intrinsics are assumed",
+        "Missing intrinsics are set to default values",
         cause="Only a focal length was given.",
         hint="Give the calibrated fy, cx and cy (--fy, --cx, --cy).",
     ),
@@ -255,8 +255,8 @@ _KINDS = (
         REASON,
         "The calibration's unit is assumed to be metres",
         cause="The file states no unit, and in metres its baseline would be longer than 1.5 m.",
-        hint="Give the measured baseline (baseline_m, --baseline), or state the unit in the file, as in "
-        "translation_mm.",
+        hint="Give the measured baseline (baseline_m, --baseline), or add the unit to the name of the "
+        "translation in the file, such as translation_mm.",
     ),
     FindingKind(
         "calibration.unrectified",
@@ -277,7 +277,8 @@ _KINDS = (
         WARNING,
         "The focal length of SceneFlow images is assumed",
         cause="camera_data.txt has no intrinsics, and the folder name does not state the lens.",
-        hint="Ignore the warning for 35 mm; otherwise keep Driving's folder 15mm_focallength in the path.",
+        hint="Ignore the warning if the lens is 35 mm. For Driving's 15 mm images, keep the folder name "
+        "15mm_focallength in the path.",
     ),
     FindingKind(
         "calibration.kitti-cameras",
@@ -304,8 +305,8 @@ _KINDS = (
     FindingKind(
         "estimate.learned",
         ASSUMPTION,
-        "The poses are from learned matches",
-        cause="SIFT gives no pose, because the images are dark or blurred, or have little or repetitive "
+        "The poses come from learned matches",
+        cause="SIFT found no pose, because the images are dark or blurred, or have little or repetitive "
         "texture.",
         hint="Check the result, for example with a known length. Take brighter, sharper images.",
     ),
@@ -389,15 +390,16 @@ _KINDS = (
     FindingKind(
         "capture.masks",
         WARNING,
-        "Masks of the capture are used",
-        cause="The file names masks (mask_path), or a folder masks is next to the images, as for COLMAP.",
+        "Masks found in the capture are used",
+        cause="The camera file lists masks (mask_path), or a folder named masks is next to the images, as in "
+        "COLMAP.",
         hint="If the masks mark something else, such as one object, move their folder, or pass an all-white "
         "mask (--mask) to ignore them.",
     ),
     FindingKind(
         "image.overlays",
         WARNING,
-        "Part of the image is static",
+        "Part of the image is the same in every frame",
         cause="Text or a logo is burnt into the frames, or part of the rig is visible.",
         hint="These pixels get no depth. If they show the scene, pass an all-white mask (--mask) to keep "
         "them.",
@@ -405,8 +407,8 @@ _KINDS = (
     FindingKind(
         "capture.no-mask",
         WARNING,
-        "Masks that the capture names do not exist",
-        cause="The file has a mask_path for frames whose mask is missing.",
+        "Masks listed in the camera file are missing",
+        cause="The file has a mask_path for frames whose mask does not exist.",
         hint="Restore the masks, or give their folder (--mask).",
     ),
     FindingKind(
@@ -428,7 +430,8 @@ _KINDS = (
         REASON,
         "The image sizes differ slightly from the calibrated sizes",
         cause="The images have not been undistorted, or come from another export.",
-        hint="Give the folder of the matching images (--images), or the model of these images.",
+        hint="Give the folder of the matching images (--images), or the reconstruction that these images "
+        "belong to.",
     ),
     FindingKind(
         "capture.assumed-metres",
@@ -455,9 +458,9 @@ _KINDS = (
     FindingKind(
         "capture.assumed-k",
         WARNING,
-        "K is assumed from the dataset",
+        "K is the published value for the dataset",
         cause="7-Scenes and TUM RGB-D have no calibration file.",
-        hint="Give K (--K) for other cameras.",
+        hint="Give K (--K) if another camera was used.",
     ),
     FindingKind(
         "capture.no-trajectory",
@@ -565,7 +568,7 @@ _KINDS = (
         WARNING,
         "The capture has several disconnected components",
         cause="No frames connect them.",
-        hint="Record frames between the components, or process each one separately.",
+        hint="Record frames that connect the components, or process each one separately.",
     ),
     FindingKind(
         "capture.no-video",
@@ -603,8 +606,8 @@ _KINDS = (
         ASSUMPTION,
         "The time between the starts of two videos is estimated",
         cause="The videos have different lengths, or their brightness changes at different times.",
-        hint="Give the time in seconds by which RIGHT started after LEFT (--offset), or trim both videos to "
-        "the same time span.",
+        hint="Give the start time of RIGHT relative to LEFT, in seconds (--offset; positive if RIGHT started "
+        "later), or trim both videos to the same time span.",
     ),
     FindingKind(
         "config.unknown-parameters",

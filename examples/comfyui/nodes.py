@@ -81,7 +81,10 @@ class GeoDiffCalibration:
                 "baseline_m": ("FLOAT", number | {"tooltip": "Distance between the cameras in metres."}),
                 "image": (
                     "IMAGE",
-                    {"tooltip": "Left image: needed for its centre, and for files with several image sizes."},
+                    {
+                        "tooltip": "Left image: sets the default cx and cy, and selects one of a file's "
+                        "image sizes."
+                    },
                 ),
                 "cx_right": (
                     "FLOAT",

@@ -26,7 +26,9 @@ MAX_ASPECT_RATIO = 2.0
 #: Focal length over width below which a lens without distortion would have a field of view above 150 degrees.
 NORMALISED = 0.134
 #: How to scale K to another image size.
-SCALED_K = "with s = new size / old size use fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
+SCALED_K = (
+    "scale it: with s = new size / old size, use fx * s and (cx + 0.5) * s - 0.5, and likewise for fy and cy"
+)
 #: Hint that defines E.
 POSE = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
 
@@ -43,7 +45,7 @@ def _as_matrix(value: Any, name: str, hint: str, *shapes: tuple[int, int]) -> np
     if matrix.shape not in shapes:
         bad_value(name, f"a {rows}x{columns} matrix", f"shape {matrix.shape}" if matrix.ndim else value, hint)
     if not np.isfinite(matrix).all():
-        bad_value(name, "finite", "NaN or infinity in it", "Check the calibration file.")
+        bad_value(name, "finite", "NaN or infinity", "Check the calibration file.")
     return matrix
 
 
@@ -64,9 +66,9 @@ def check_intrinsics_fit(K: np.ndarray, width: int, height: int, name: str, imag
     cx, cy = K[0, 2], K[1, 2]
     if not (0 <= cx <= width and 0 <= cy <= height):
         raise_input_error(
-            f"{name} has its principal point ({cx:.1f}, {cy:.1f}) outside {image} of {width}x{height} "
-            f"pixels. If it is for another resolution, {SCALED_K}. If the image is a crop, set cropped=True "
-            "(--cropped).",
+            f"{name} has its principal point at ({cx:.1f}, {cy:.1f}), outside {image} ({width}x{height} "
+            f"pixels). If {name} is for another resolution, {SCALED_K}. If the image is a crop, set "
+            "cropped=True (--cropped).",
             code="camera.principal-point",
         )
 
@@ -76,7 +78,7 @@ def check_calibrated_size(
 ) -> None:
     """Raise an error if an image's ``(width, height)`` differs from the calibrated size, if known."""
     if calibrated is not None and tuple(calibrated) != size:
-        expected = "of {}x{} pixels, as in {}".format(*calibrated, source)
+        expected = "{}x{} pixels, as in {}".format(*calibrated, source)
         bad_value(name, expected, "{}x{}".format(*size), hint, code="calibration.size")
 
 
@@ -85,22 +87,22 @@ def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -
     height, width = size
     if K[0, 0] < NORMALISED * width:
         hint = (
-            "If it is in millimetres, fx = millimetres * width / sensor width in millimetres (36 for a 35 mm "
-            "equivalent, as in EXIF). If it is normalised by the image size, multiply its first row by the "
-            "width and its second by the height."
+            "If fx is in millimetres, multiply it by image width / sensor width, with the sensor width in "
+            "millimetres (36 for a 35 mm equivalent, as in EXIF). If K is normalised by the image size, "
+            "multiply its first row by the width and its second row by the height."
         )
-        expected = f"in pixels of {image} of {width}x{height}"
-        bad_value(name, expected, f"fx {K[0, 0]:g}", hint, code="camera.focal-unit")
+        expected = f"in pixels of {image} ({width}x{height})"
+        bad_value(name, expected, f"fx = {K[0, 0]:g}", hint, code="camera.focal-unit")
     check_intrinsics_fit(K, width, height, name, image)
     x, y = K[0, 2] / width, K[1, 2] / height
     place = ""
     if min(x, y) < NEAR_BORDER or max(x, y) > 1.0 - NEAR_BORDER:
-        place = f"near the border of {image} of {width}x{height} pixels"
+        place = f"near the border of {image} ({width}x{height} pixels)"
     elif min(abs(x - 0.5), abs(y - 0.5)) > OFF_MIDDLE and abs(x - y) < NEARLY_ALIKE:
-        place = f"as for an image {x + y:.2g} times the size of {image}"
+        place = f"where it would be in an image {x + y:.2g} times the size of {image}"
     if place:
-        at = f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) {place}"
-        warn(Finding("camera.principal-point", f"{at}. If it is for another resolution, {SCALED_K}."))
+        at = f"{name} has its principal point at ({K[0, 2]:.1f}, {K[1, 2]:.1f}), {place}"
+        warn(Finding("camera.principal-point", f"{at}. If {name} is for another resolution, {SCALED_K}."))
     if max(K[0, 0] / K[1, 1], K[1, 1] / K[0, 0]) > MAX_ASPECT_RATIO:
         numbers = f"{name} has fx {K[0, 0]:.5g} and fy {K[1, 1]:.5g}"
         message = f"{numbers}, but pixels are usually square. Check both focal lengths."
@@ -154,9 +156,9 @@ def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
     """Raise an error for integers, which are in a file's own unit or are truncated metres."""
     if array.dtype.kind == "f":
         return
-    hint = "Divide the file's integers by its factor: 1000 for millimetres, 256 for KITTI."
+    hint = "Divide integers by the number of units per metre: 1000 for millimetres, 256 for KITTI."
     if array.shape[1] == 3:
-        hint = "Divide millimetres by 1000. Integers truncate metres: give floats."
+        hint = "Divide millimetres by 1000. Metres as integers are truncated: give floats."
     bad_value(name, "metres as floats", got or f"dtype {array.dtype}", hint)
 
 

@@ -15,7 +15,8 @@ from geodiff_plugin.findings import Finding
 MAX_GOT = 400
 #: Hint for a negative baseline.
 NEGATIVE_BASELINE = (
-    "With a negative baseline the left image is the right one. Swap the images, and give its length."
+    "A negative baseline means that the left and right images are swapped. Swap them, and give a positive "
+    "baseline."
 )
 #: Findings passed to ``warn`` within the innermost ``captured_warnings`` block.
 _CAPTURED: ContextVar[list[Finding] | None] = ContextVar("captured_warnings", default=None)

@@ -66,7 +66,7 @@ class FiniteWatch:
         hint = "Load the prior with dtype=torch.bfloat16 or torch.float32."
         if short != "float16":
             hint = "Check that all weights of the prior are finite."
-        bad_value(f"{name} of denoising step {step + 1}", f"finite in {short}", "NaN or infinity in it", hint)
+        bad_value(f"{name} of denoising step {step + 1}", f"finite in {short}", "NaN or infinity", hint)
 
 
 #: Plain steps in which the latent's loss, a mean over visible pixels, is multiplied by the number of pixels:

@@ -249,7 +249,7 @@ def _request(**options: Any) -> Request:
 def _of_file(given: CameraFields, size: tuple[int, int]) -> Request:
     if not given.calib:
         raise PageError(
-            "The calibration file is missing. Choose one, or choose to estimate the cameras from the images."
+            "The calibration file is missing. Choose one, or estimate the camera positions from the images."
         )
     return _request(baseline=given.baseline, calib=tuple(map(Path, given.calib)))
 

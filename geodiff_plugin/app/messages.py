@@ -33,7 +33,7 @@ class Message:
 _SWAP = "Swap the left and the right image, then run again."
 _CALIBRATION = "Check that the calibration file belongs to these two images."
 _RETAKE = "Take two new images of a scene in which nothing moves."
-_LENGTH = "Check the distance between the cameras and its unit: the page takes metres."
+_LENGTH = "Check the distance between the cameras and its unit: the page expects metres."
 _WIDER = "Take the second image from a position further to the side."
 _CROP = "Use the original images, not cropped or resized."
 _NOTHING = "No action is needed."
@@ -41,19 +41,19 @@ _NOTHING = "No action is needed."
 #: Code of a finding -> sentence and what to do.
 FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     "image.frames": ("An image file has several pages. The first one is used.", _NOTHING),
-    "image.dark": ("A 16-bit image is nearly black.", "Export it with its full brightness, or as 8 bits."),
+    "image.dark": ("A 16-bit image is nearly black.", "Export it at full brightness, or as an 8-bit image."),
     "image.bits": ("A 16-bit image is read as 10, 12 or 14 bits.", _NOTHING),
     "image.alpha": ("Transparent pixels get no depth.", "Remove the transparency if they show the scene."),
     "image.rotated": (
-        "An image was rotated upright, because its file states its orientation.",
+        "An image was rotated upright, according to the orientation tag in its file.",
         "Make sure that the calibration is for the upright image.",
     ),
     "image.orientation": (
-        "The orientation that an image file states is not applied.",
+        "An image file has an orientation tag, which is not applied.",
         "Save the image upright.",
     ),
     "image.overlays": (
-        "Part of the image does not move with the scene, such as text or a logo.",
+        "Part of the image, such as text or a logo, does not belong to the scene.",
         "Use images without it, if it covers what you measure.",
     ),
     "camera.from-exif": (
@@ -70,7 +70,7 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Check it in the form. It is the angle across the width of the image.",
     ),
     "camera.assumed-intrinsics": (
-        "The centre of the lens is assumed to be the centre of the image.",
+        "The optical centre is assumed to be at the centre of the image.",
         "Enter fy, cx and cy if you know them.",
     ),
     "camera.zoom": ("An image was zoomed digitally.", "Take it again without zoom, or enter fx."),
@@ -79,7 +79,8 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Enter the right camera's cx if you know it.",
     ),
     "camera.principal-point": (
-        "The calibrated centre is far from the centre of the image, as if the image were cropped or resized.",
+        "The optical centre in the calibration is far from the centre of the image, as if the image were "
+        "cropped or resized.",
         f"{_CROP} {_CALIBRATION}",
     ),
     "camera.aspect-ratio": (
@@ -97,7 +98,7 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     "camera.scaled": ("The calibration seems to be for another image size.", _CROP),
     "camera.focal-scaled": ("The focal length seems to be for another image size.", _CROP),
     "camera.cx-mismatch": (
-        "The right camera's cx must differ from the left camera's, or the images do not belong together.",
+        "Either the two cameras have different cx values, or the images do not belong together.",
         "Enter the right camera's cx, or use a calibration file for both cameras.",
     ),
     "camera.field-of-view": (
@@ -105,8 +106,8 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Check the focal length if the lens is neither a telephoto nor a fisheye lens.",
     ),
     "camera.unconfirmed-field-of-view": (
-        "The lens would have an unusual field of view.",
-        "Check fx: it is in pixels, for images of this size.",
+        "This focal length implies an unusual field of view.",
+        "Check that fx is in pixels, for images of this size.",
     ),
     "calibration.no-unit": (
         "The calibration has no unit of length.",
@@ -118,28 +119,31 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     ),
     "calibration.unrectified": ("The images are treated as not rectified.", _CALIBRATION),
     "calibration.doffs": ("The right cx in the calibration contradicts doffs.", _CALIBRATION),
-    "calibration.assumed-lens": ("The focal length is assumed from the data set.", _CALIBRATION),
-    "calibration.kitti-cameras": ("KITTI's colour cameras are used.", "Give images of the colour cameras."),
-    "baseline.long": ("The cameras would be more than 20 m apart.", _LENGTH),
-    "baseline.short": ("The cameras would be less than a millimetre apart.", _LENGTH),
-    "pose.unit": ("The cameras and the scene would be implausibly far apart.", _LENGTH),
+    "calibration.assumed-lens": ("The focal length is the data set's usual one.", _CALIBRATION),
+    "calibration.kitti-cameras": ("KITTI's colour cameras are used.", "Use images of the colour cameras."),
+    "baseline.long": ("With this baseline, the cameras are more than 20 m apart.", _LENGTH),
+    "baseline.short": ("With this baseline, the cameras are less than a millimetre apart.", _LENGTH),
+    "pose.unit": ("The distances between the cameras and to the scene are implausibly large.", _LENGTH),
     "pose.opengl": ("The camera positions in the file seem to use OpenGL axes.", _CALIBRATION),
     "pose.opengl-inverse": ("The camera positions in the file seem to be inverted.", _CALIBRATION),
     "pose.transposed": ("The rotation in the file seems to be transposed.", _CALIBRATION),
     "pose.mixed": ("The camera positions in the file mix two conventions.", _CALIBRATION),
     "pose.vertical": (
         "One camera seems to be above the other, not next to it.",
-        "Use a calibration file that states this, or estimate the cameras from the images.",
+        "Use a calibration file with the vertical offset, or estimate the camera positions from the images.",
     ),
     "pose.unconstrained": ("The images do not determine how the cameras were placed.", _WIDER),
     "pose.unchecked": ("The calibration could not be checked: too few points match.", _CALIBRATION),
     "pose.few-matches": ("Too few points match to correct the calibration.", _CALIBRATION),
     "pose.kept": ("The images deviate from the calibration by more than a pixel.", _CALIBRATION),
     "pose.refined": ("The calibration was corrected slightly to fit the images.", _NOTHING),
-    "pose.too-far": ("The images fit other camera positions than the calibration's.", _CALIBRATION),
+    "pose.too-far": (
+        "The images fit different camera positions from the ones in the calibration.",
+        _CALIBRATION,
+    ),
     "pose.epipolar-error": (
         "The images do not fit the calibration.",
-        f"{_CALIBRATION} Or estimate the cameras from the images.",
+        f"{_CALIBRATION} Or estimate the camera positions from the images.",
     ),
     "pose.residual": ("The images fit the calibration only roughly.", _CALIBRATION),
     "estimate.second-motion": ("Part of the scene moved, or a pattern repeats.", _RETAKE),
@@ -156,7 +160,8 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     "scale.none": ("No length is known.", "Enter the distance between the cameras, or a known length."),
     "scale.from-prior": ("The scale is the prior's guess.", "Enter a measured length."),
     "scale.guessed": (
-        "The distance between the cameras is a guess. Every length may be off by as much as the guess.",
+        "The distance between the cameras is a guess. Every length has the same relative error as this "
+        "guess.",
         "Measure it, or mark an object whose length you know.",
     ),
     "scale.uncertain": ("The scale is uncertain.", "Enter the measured distance between the cameras."),
@@ -166,13 +171,16 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Use two images from different positions, with objects at different distances.",
     ),
     "views.moved": ("Part of the scene moved between the images.", _RETAKE),
-    "views.tearing": ("An image is torn: it shows parts of two moments.", "Take that image again."),
+    "views.tearing": ("An image is torn: it combines parts of two video frames.", "Take that image again."),
     "views.rolling-shutter": (
         "Vertical lines lean in the right image: the camera or the scene moved during the exposure.",
         "Take it again with the camera held still.",
     ),
     "views.distorted": ("Straight lines are bent by the lens.", _CALIBRATION),
-    "views.residual-trend": ("The images fit the calibration unevenly.", _CALIBRATION),
+    "views.residual-trend": (
+        "The images fit the calibration well in some regions and badly in others.",
+        _CALIBRATION,
+    ),
     "views.overlap": (
         "The images show mostly different parts of the scene.",
         "Take them so that at least half of one is visible in the other.",
@@ -188,33 +196,42 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     ),
     "depth.repeated-pattern": (
         "A repeated pattern fits several depths, so its depth is ambiguous.",
-        "Take images that show more than the pattern, or with a shorter distance between the cameras.",
+        "Take images that show more than the pattern, or move the cameras closer together.",
     ),
     "views.letterbox": (
         "The images have black borders.",
         "Crop them, unless the calibration is for images with these borders.",
     ),
     "views.defocused": ("One image is much blurrier than the other.", "Take that image again."),
-    "depth.inverted-order": ("Near and far are swapped. Left and right image are probably swapped.", _SWAP),
-    "depth.range": ("The scene extends beyond the given depths.", "Clear the nearest and farthest depth."),
-    "depth.off-matches": ("The depth does not fit the matched points.", "Choose the preset default."),
+    "depth.inverted-order": (
+        "Near and far are swapped. The left and right images are probably swapped.",
+        _SWAP,
+    ),
+    "depth.range": (
+        "The scene extends beyond the given depths.",
+        "Clear the fields 'Nearest depth' and 'Farthest depth'.",
+    ),
+    "depth.off-matches": ("The depth does not fit the matched points.", "Choose the preset 'default'."),
     "depth.order-points": ("The prior contradicts the known depths.", "Choose another prior."),
-    "depth.occlusion": ("Far objects hide near ones. Left and right image are probably swapped.", _SWAP),
-    "depth.order": ("Prior and matches disagree about what is near.", f"{_SWAP} {_CALIBRATION}"),
+    "depth.occlusion": ("Far objects hide near ones. The left and right images are probably swapped.", _SWAP),
+    "depth.order": (
+        "The prior and the matches disagree about which objects are near.",
+        f"{_SWAP} {_CALIBRATION}",
+    ),
     "depth.negative-disparity": (
         "Some points match in the wrong direction.",
         f"{_CALIBRATION} Or enter the right camera's cx.",
     ),
     "depth.search-edge": ("The scale may be outside of the range that was searched.", _LENGTH),
-    "prior.one-member": ("This prior always gives the same result, so one member runs.", _NOTHING),
-    "prior.unit": ("The depth is far from what the prior expects.", _LENGTH),
+    "prior.one-member": ("This prior always gives the same result, so it runs only once.", _NOTHING),
+    "prior.unit": ("The depth differs from what the prior expects by more than a factor of 20.", _LENGTH),
     "prior.metres": ("The depth differs from what the prior expects.", _LENGTH),
     "prior.order": (
         "The prior swaps near and far, and the matches contradict it.",
         "Do not measure where the confidence is low.",
     ),
     "verdict.not-trusted": ("Do not trust this depth.", "See the reasons."),
-    "verdict.not-judged": ("Nothing could test this depth.", "Use images with more overlap and texture."),
+    "verdict.not-judged": ("This depth could not be checked.", "Use images with more overlap and texture."),
 }
 
 #: Code of an input error -> sentence and what to do.
@@ -233,14 +250,14 @@ ERRORS_ON_PAGE: dict[str, tuple[str, str]] = {
     "calibration.size": ("The calibration is for images of another size.", _CROP),
     "calibration.one-camera": (
         "The calibration file describes one camera.",
-        "Add the file for the other camera, or choose to estimate the cameras from the images.",
+        "Add the file for the other camera, or estimate the camera positions from the images.",
     ),
-    "camera.principal-point": ("The calibrated centre is outside of the image.", _CROP),
+    "camera.principal-point": ("The optical centre in the calibration is outside the image.", _CROP),
     "camera.focal-unit": ("The focal length is not in pixels.", "Enter fx in pixels of this image."),
     "baseline.sign": ("The distance between the cameras must be positive.", _SWAP),
     "estimate.few-matches": (
         "The two images have too little in common.",
-        "Take both of the same scene, sharp and well lit, with at least half of one visible in the other.",
+        "Take two sharp, well-lit images of the same scene, with at least half of one visible in the other.",
     ),
     "estimate.no-motion": (
         "The two images do not show one scene from two positions.",

@@ -22,8 +22,8 @@ HEADER = """
 """
 WAITING = '<div class="box box-quiet">Results appear here. Try one of the examples.</div>'
 HOW_TO_MEASURE = (
-    '<div class="box box-quiet">Click a point to read its depth, or type its pixel. Click a second point to '
-    "measure the distance; every two points make a segment.</div>"
+    '<div class="box box-quiet">Click a point to read its depth, or enter its pixel coordinates. Click a '
+    "second point to measure the distance; every two points make a segment.</div>"
 )
 #: Hints above the 3D view.
 CLICK_TWO = "Click two points to measure the distance between them."
@@ -89,8 +89,8 @@ VIEWER = """
     <span class="viewer-count"></span>
   </div>
   <div class="viewer-hint legend-caption">
-    <span class="pointer-fine">Drag to rotate, with shift or the right button to move. Click the view, then
-      scroll to zoom.</span>
+    <span class="pointer-fine">Drag to rotate; drag with Shift or the right mouse button to move. Click the
+      view, then scroll to zoom.</span>
     <span class="pointer-coarse">Drag to rotate, two fingers to move and zoom, tap to measure.</span>
   </div>
 </div>
@@ -99,7 +99,7 @@ VIEWER = """
 
 def scale_note(rel_std: float) -> str:
     """Return the sentence about the uncertainty of the scale, which every length includes."""
-    return f" It includes ± {100 * rel_std:.2g} % of the scale, which all lengths have in common."
+    return f" This includes ± {100 * rel_std:.2g} % for the scale, which affects all lengths equally."
 
 
 def headline(number: str, hint: str) -> str:
@@ -214,7 +214,7 @@ def earlier(notice: str, shown: Shown) -> str:
     """Return the status while an earlier result stays on display, dimmed: a notice, and its banner."""
     name = html.escape(shown.name)
     return (
-        f'{notice}<div class="earlier"><div class="earlier-name">Below: the earlier result of {name}</div>'
+        f'{notice}<div class="earlier"><div class="earlier-name">Below: the previous result, for {name}</div>'
         f"{banner(shown)}</div>"
     )
 

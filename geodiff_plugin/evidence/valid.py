@@ -77,7 +77,7 @@ def as_mask(value: Any, name: str, size: tuple[int, int]) -> Tensor | None:
     mask = value[..., :3].max(-1) if value.ndim == 3 else value
     if mask.shape != size:
         got = f"{mask.shape[1]}x{mask.shape[0]}" if mask.ndim == 2 else f"shape {mask.shape}"
-        bad_value(name, f"of its image's {size[1]}x{size[0]} pixels", got, "White pixels are valid.")
+        bad_value(name, f"{size[1]}x{size[0]} pixels, like its image", got, "White pixels are valid.")
     if mask.dtype.kind in "ui":
         mask = mask > WHITE * (np.iinfo(mask.dtype).max if mask.max() > 1 else 1)
     elif mask.dtype.kind == "f":

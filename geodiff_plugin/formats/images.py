@@ -109,7 +109,7 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[Finding]]:
         value = value.astype(np.float32) / np.iinfo(value.dtype).max
     elif value.dtype.kind == "f":
         if not np.isfinite(value).all():
-            bad_value(name, "finite", "NaN or infinity in it", "Mask or fill those pixels first.")
+            bad_value(name, "finite", "NaN or infinity", "Mask or fill those pixels first.")
         low, high = float(value.min()), float(value.max())
         if low < -OVERSHOOT or high > 1 + OVERSHOOT:
             hint = "Divide by 255." if low >= 0 else "Map [-1, 1] to [0, 1] with (x + 1) / 2."

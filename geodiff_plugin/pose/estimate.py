@@ -74,8 +74,8 @@ NO_UNIT = Finding(
 
 LEARNED = Finding(
     "estimate.learned",
-    "SIFT gives no pose of these images, so the poses are from learned matches (XFeat), which may be wrong "
-    "without further signs. Check the result, or take brighter, sharper images.",
+    "SIFT found no pose for these images, so the poses come from learned matches (XFeat), which may be wrong "
+    "without any other symptom. Check the result, or take brighter, sharper images.",
 )
 #: Matches sparse features of the left image in the right ones.
 Matcher = Callable[[Sequence[GreyImage]], Tracks]
@@ -160,7 +160,7 @@ def estimate_poses(
 ) -> tuple[Tracks, list[EstimatedPose]]:
     """Estimate the poses of two or more images, with a first baseline of 1; returns inliers and poses.
 
-    ``matcher`` is used if SIFT gives no pose.
+    ``matcher`` is used if SIFT finds no pose.
     """
     try:
         return _poses_of_tracks(sparse_tracks(views), OF_SIFT)

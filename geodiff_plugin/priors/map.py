@@ -103,7 +103,9 @@ class DepthMapPipeline(DirectMapPipeline):
             sides = values.shape[-1] / values.shape[-2], size[1] / size[0]
             if math.log(sides[0]) * math.log(sides[1]) < MIN_LOG_PRODUCT:
                 got = "{1}x{0} pixels".format(*values.shape[-2:])
-                bad_value("depth_map", f"of the image's {size[1]}x{size[0]} pixels", got, "Is it transposed?")
+                bad_value(
+                    "depth_map", f"{size[1]}x{size[0]} pixels, like the image", got, "Is it transposed?"
+                )
             filled, known = _filled(values.to(view.device))
             inside = F.interpolate(known.float(), size, mode="bilinear", antialias=True) > ALL_KNOWN
             prepared.append((_resized(filled, view / 2 + 0.5), inside))

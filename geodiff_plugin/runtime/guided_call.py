@@ -310,7 +310,7 @@ def _check_arguments(call: Mapping[str, Any], images: int) -> None:
         bad_value("generator", expected, f"a list of {len(given)}")
     latents = call["latents"]
     if isinstance(latents, Tensor) and not latents.isfinite().all():
-        bad_value("latents", "finite", "NaN or infinity in it")
+        bad_value("latents", "finite", "NaN or infinity")
 
 
 def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance, layers: Layers) -> None:

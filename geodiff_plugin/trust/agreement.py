@@ -17,7 +17,7 @@ INCONSISTENT = FindingKind(
     "The views are inconsistent",
     cause="The axis or rotation of E is wrong, the images are unrectified or distorted, K is for another "
     "image size, one image is mirrored, or the images show different scenes or times.",
-    hint="Check these in this order; overview.png shows where the views disagree.",
+    hint="Check these causes in this order; overview.png shows where the views disagree.",
 )
 
 

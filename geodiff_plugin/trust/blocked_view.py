@@ -72,9 +72,9 @@ class BlockedView(Check[BlankRegions]):
         low, high = sorted((fact.left, fact.right))
         yield Finding(
             BLOCKED,
-            f"{100 * high:.0f} % of the {blank} is blank or masked at its border, but {100 * low:.0f} % of "
-            f"the {other}, so depth is not measured there. Uncover the lens, or mask that region in both "
-            "images.",
+            f"{100 * high:.0f} % of the {blank} is blank or masked at its border, but only "
+            f"{100 * low:.0f} % of the {other}. Depth is not measured there. Uncover the lens, or mask that "
+            "region in both images.",
         )
 
 

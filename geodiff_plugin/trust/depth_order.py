@@ -20,7 +20,7 @@ ORDER = FindingKind(
     REASON,
     "Prior and matches disagree on the depth order",
     cause="E, K or the order of the images is wrong, or the right image shows another scene.",
-    hint="Check these in this order.",
+    hint="Check these causes in this order.",
 )
 PRIOR_ORDER = FindingKind(
     "prior.order",

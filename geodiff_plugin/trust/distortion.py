@@ -20,8 +20,8 @@ DISTORTED = FindingKind(
     REASON,
     "The images have residual lens distortion",
     cause="The images are raw but the calibration has no distortion coefficients, or they are rectified but "
-    "it has some.",
-    hint="Give rectified images, or raw images with a calibration that has the distortion coefficients.",
+    "the calibration still has coefficients.",
+    hint="Use rectified images, or raw images with a calibration that has the distortion coefficients.",
 )
 RESIDUAL_TREND = FindingKind(
     "views.residual-trend",

@@ -17,9 +17,9 @@ from geodiff_plugin.types import RejectedPose
 FEW_MATCHES = FindingKind(
     "pose.few-matches",
     REASON,
-    "The pose was refined or kept with too few matching features",
-    cause="The pose contradicts optical flow, and too few features match to check it reliably.",
-    hint="Give a more accurate pose, or views with more texture or overlap.",
+    "Too few features match to confirm the refined or given pose",
+    cause="The given pose contradicts optical flow, and too few features match to check it reliably.",
+    hint="Give a more accurate pose, or use views with more texture or overlap.",
 )
 KEPT = FindingKind(
     "pose.kept",
@@ -47,7 +47,7 @@ EPIPOLAR_ERROR = FindingKind(
     REASON,
     "The epipolar error is above 4 px",
     cause="The pair is not rectified, K is for other images, or E is for another pair.",
-    hint="Check these in this order.",
+    hint="Check these causes in this order.",
 )
 RESIDUAL = FindingKind(
     "pose.residual",

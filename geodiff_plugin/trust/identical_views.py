@@ -17,9 +17,9 @@ from geodiff_plugin.trust.stages import ResultStage
 IDENTICAL = FindingKind(
     "views.identical",
     REASON,
-    "Left and right image are identical",
+    "The left and right images are identical",
     cause="One file was given twice.",
-    hint="Give two images from different viewpoints.",
+    hint="Use two images from different viewpoints.",
     explains=("*",),
 )
 
@@ -64,7 +64,7 @@ class IdenticalViews(Check[Difference]):
         if fact and fact.largest < min(cls.MAX_DIFFERENCE, cls.MAX_OF_CONTRAST * fact.contrast):
             yield Finding(
                 IDENTICAL,
-                "The left image and a right view are identical. Give two images from different viewpoints.",
+                "The left image and a right view are identical. Use two images from different viewpoints.",
             )
 
 

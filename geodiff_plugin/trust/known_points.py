@@ -56,7 +56,7 @@ SOME_CONTRADICT = FindingKind(
     "points.some-contradict",
     REMARK,
     "More than a quarter of the known depths contradict the matches",
-    cause="The points are noisy, at edges, or visible only to the sensor.",
+    cause="The points are noisy, at edges, or on surfaces that only the depth sensor sees.",
     hint="Give their confidence (points_confidence, --points-confidence), or remove them.",
 )
 FEW = FindingKind(
@@ -203,8 +203,9 @@ def _factor(kind: FindingKind, fact: Points) -> Finding:
 def _contradict(kind: FindingKind, fact: Points) -> Finding:
     return Finding(
         kind,
-        f"{100 * (fact.fraction_off or 0.0):.0f} % of the known depths, which the result follows, contradict "
-        "the matches. Give --points-confidence (points_confidence), or remove them.",
+        f"{100 * (fact.fraction_off or 0.0):.0f} % of the known depths contradict the matches, and the "
+        "result follows the known depths. Give --points-confidence (points_confidence), or remove wrong "
+        "points.",
     )
 
 

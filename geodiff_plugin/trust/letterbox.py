@@ -52,7 +52,7 @@ class Letterbox(Check[LetterboxWidth]):
         if fact is not None:
             yield Finding(
                 LETTERBOX,
-                f"The images are letterboxed, each bar covering {100 * fact.width:.0f} % of the side. Check "
+                f"The images are letterboxed: each bar covers {100 * fact.width:.0f} % of the image. Check "
                 "that K is for the images with these bars.",
             )
 

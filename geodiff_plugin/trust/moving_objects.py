@@ -69,8 +69,8 @@ class MovingObjects(Check[Moved]):
         if fact and fact.fraction > cls.MAX_FRACTION:
             yield Finding(
                 MOVED,
-                f"{100 * fact.fraction:.0f} % of the matches moved between the images, so their depth is "
-                "wrong. Capture both images simultaneously.",
+                f"{100 * fact.fraction:.0f} % of the matches are on objects that moved between the "
+                "images, so their depth is wrong. Capture both images simultaneously.",
             )
 
 

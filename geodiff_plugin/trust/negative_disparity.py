@@ -23,11 +23,11 @@ NEGATIVE_DISPARITY = FindingKind(
 CX_MISMATCH = FindingKind(
     "camera.cx-mismatch",
     REASON,
-    "The right camera's cx differs from the left camera's",
+    "The right camera's cx seems to differ from the left camera's",
     cause="Only one K was given for two parallel cameras, and it leads to negative disparities.",
     hint="Give the right camera's calibrated matrix (K_right, --K-right) or cx (--cx-right). The difference "
-    "in the message is only a lower bound, so check one known distance afterwards. If both cx are equal, "
-    "check E and the right image.",
+    "in the message is only a lower bound, so check one known distance afterwards. If the calibrated cx "
+    "values are equal, check E and the right image.",
 )
 
 #: Code of the assumption under which the right camera's cx is the most likely cause.
@@ -95,7 +95,7 @@ def _negative_disparity(fact: Negative) -> Finding:
     return Finding(
         NEGATIVE_DISPARITY,
         f"{100 * fact.fraction:.0f} % of the matches have negative disparity, so depth is wrong. Check the "
-        "right cx (--cx-right), E, and crops.",
+        "right cx (--cx-right), E, and whether an image was cropped.",
     )
 
 

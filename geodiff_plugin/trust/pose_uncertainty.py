@@ -17,7 +17,8 @@ SCALE = FindingKind(
     "scale.uncertain",
     REASON,
     "The scale of the refined pose is uncertain",
-    cause="The baseline was not measured, and it contradicts the scene depth under the given pose.",
+    cause="The baseline was not measured, and the given baseline and scene depth lead to different scales of "
+    "the refined pose.",
     hint="Give the measured baseline (--baseline, measured_baseline=True), or at least three known points.",
 )
 UNCONSTRAINED = FindingKind(
@@ -25,7 +26,7 @@ UNCONSTRAINED = FindingKind(
     REASON,
     "The matches do not constrain the pose",
     cause="The baseline is short or the matches are few, so rotation and translation are ambiguous.",
-    hint="Give a more accurate pose, or views with a longer baseline.",
+    hint="Give a more accurate pose, or use views with a longer baseline.",
 )
 
 
@@ -92,8 +93,9 @@ class PoseUncertainty(Check[Uncertainty]):
         elif scale <= MAX_SCALE_SPREAD and not fixed and cls._together(scale, fact) > cls.MAX_TOGETHER:
             yield Finding(
                 UNCONSTRAINED,
-                f"The refined pose is uncertain: its scale by {100 * scale:.0f} %, and another pose changes "
-                f"depth by {100 * math.expm1(fact.depth_change):.0f} % (median). Check K and E.",
+                f"The refined pose is uncertain: its scale may be off by {100 * scale:.0f} %, and another "
+                f"equally good pose changes depth by {100 * math.expm1(fact.depth_change):.0f} % (median). "
+                "Check K and E.",
             )
 
     @classmethod

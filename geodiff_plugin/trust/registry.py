@@ -83,7 +83,7 @@ NOT_JUDGED = FindingKind(
     WARNING,
     "This depth was not judged",
     cause="There are neither matches from a second view nor enough known depths across the image.",
-    hint="Give an overlapping second view, or at least 50 points spread over the image.",
+    hint="Add an overlapping second view, or at least 50 known points spread over the image.",
 )
 KINDS = FINDINGS | {
     kind.code: kind

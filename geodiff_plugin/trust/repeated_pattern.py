@@ -18,7 +18,8 @@ REPEATED = FindingKind(
     REMARK,
     "Part of the image is a repeated pattern",
     cause="A fence, bars, tiles, blinds or shelves look the same one period further along the epipolar line.",
-    hint="Filter by confidence there, or rotate the rig so that the baseline is not along the repetition.",
+    hint="Filter by confidence there, or rotate the rig so that the pattern does not repeat along the "
+    "baseline.",
 )
 UNDECIDED = FindingKind(
     "depth.repeated-pattern",
@@ -26,8 +27,8 @@ UNDECIDED = FindingKind(
     "A repeated pattern makes the depth ambiguous",
     cause="The pattern matches at several depths, and neither the prior nor the surroundings decide which is "
     "right.",
-    hint="Rotate the rig so that the baseline is not along the repetition, show more of the scene without "
-    "the pattern, use a better prior, or give known points.",
+    hint="Rotate the rig so that the pattern does not repeat along the baseline, show more of the scene "
+    "without the pattern, use a better prior, or give known points.",
 )
 
 
@@ -82,6 +83,6 @@ class RepeatedPattern(Check[Repetition]):
         elif fact.fraction > cls.MIN_FRACTION:
             yield Finding(
                 REPEATED,
-                f"{100 * fact.fraction:.0f} % of the image is a repeated pattern. The prior and the "
-                "surroundings chose its depth, which is less certain. Filter by confidence there.",
+                f"{100 * fact.fraction:.0f} % of the image is a repeated pattern. Its depth was chosen "
+                "with the prior and the surrounding depth, and is less certain. Filter by confidence there.",
             )

@@ -19,7 +19,8 @@ OFF = FindingKind(
     REASON,
     "The depth differs from the matched depths",
     cause="The scale or shift was not found.",
-    hint="Do not disable match fitting (fit_matches). Otherwise use another prior, or give known points.",
+    hint="Enable match fitting (fit_matches) if it is disabled; otherwise use another prior, or give known "
+    "points.",
 )
 
 

@@ -17,7 +17,7 @@ UNCHECKED = FindingKind(
     REASON,
     "The pose could not be checked",
     cause="Too few features match to check the pose, and the depth does not confirm it either.",
-    hint="Give views with more texture or overlap, or pose='given' for an exact pose.",
+    hint="Use views with more texture or overlap. If the pose is exact, set pose='given' (--set pose=given).",
 )
 
 
@@ -39,6 +39,6 @@ class UncheckedPose(Check[None]):
         if not (KnownPoints.agree(facts) or (MatchedFraction.well_matched(facts) and followed)):
             yield Finding(
                 UNCHECKED,
-                "The pose could not be checked: too few features match. Give views with more texture, or "
-                "pose='given' for an exact pose.",
+                "The pose could not be checked: too few features match. Use views with more texture or, if "
+                "the pose is exact, set pose='given' (--set pose=given).",
             )

@@ -93,7 +93,7 @@ def test_a_failed_or_stopped_run_keeps_the_earlier_result_dimmed_and_named(visit
     page.click("#run")  # without images
     message = page.wait_for_selector("#status .box-error", timeout=RUN_MS).inner_text()
     assert "The left image is missing. Drop a file into its field." in message
-    assert page.locator(".earlier-name").inner_text() == f"Below: the earlier result of {LABELS[0]}"
+    assert page.locator(".earlier-name").inner_text() == f"Below: the previous result, for {LABELS[0]}"
     dimmed = "() => getComputedStyle(document.querySelector('#status .verdict')).opacity"
     assert float(page.evaluate(dimmed)) < 0.6
     add_point(page, 200, 300)

@@ -146,9 +146,9 @@ def test_invalid_pixels_stay_out_of_another_camera(make_oracle):
 @pytest.mark.parametrize(
     ("masks", "said"),
     [
-        ({"right_mask": np.ones((4, 4))}, "right_mask must be of its image's 144x96 pixels"),
+        ({"right_mask": np.ones((4, 4))}, "right_mask must be 144x96 pixels, like its image"),
         ({"right_mask": (CIRCLE, CIRCLE)}, "right_mask must be one mask, or a tuple of 1"),
-        ({"mask": CIRCLE[1:]}, "mask must be of its image's 144x96 pixels"),
+        ({"mask": CIRCLE[1:]}, "mask must be 144x96 pixels, like its image"),
     ],
 )
 def test_a_mask_of_another_image_is_an_error(make_oracle, masks, said):

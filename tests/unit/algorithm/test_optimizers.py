@@ -80,7 +80,7 @@ def test_the_first_tensor_that_is_not_finite_is_named():
         watch.record("three", 4, torch.tensor([bad]))
         with pytest.raises(
             ValueError,
-            match=r"^two of denoising step 4 must be finite in bfloat16; got NaN or infinity in it\. "
+            match=r"^two of denoising step 4 must be finite in bfloat16; got NaN or infinity\. "
             "Check that all weights",
         ):
             watch.check(pipe)

@@ -132,7 +132,7 @@ def test_the_scale_has_the_uncertainty_of_its_source(pair):
 @pytest.mark.parametrize(
     ("way", "more", "message"),
     [
-        ("file", {"calib": ()}, "The calibration file is missing. Choose one, or choose to estimate"),
+        ("file", {"calib": ()}, "The calibration file is missing. Choose one, or estimate"),
         ("numbers", {"baseline": None}, "Enter the distance between the cameras as well."),
         ("numbers", {"baseline": -0.1}, "The distance between the cameras must be above 0."),
         ("numbers", {"lens": LENS | {"fx": None}}, "Enter fx in pixels as well."),

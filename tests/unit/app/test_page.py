@@ -284,7 +284,7 @@ def test_a_run_shows_its_result_before_its_files_and_keeps_it_for_its_tab(desk, 
     screen, made = Screen(desk), made_result()
     begun, first, rest, files, *_ = run(desk, jobs, made, screen)
     assert begun["progress"] == templates.running("what runs") and begun["stop"]["interactive"]
-    assert "Below: the earlier result of Playroom" in begun["status"]
+    assert "Below: the previous result, for Playroom" in begun["status"]
     assert {"status", "scene_data", "headline", "secret"} <= set(first) and "depth" not in first
     assert first["progress"] == "" and not first["stop"]["interactive"]
     assert {"depth", "confidence"} <= set(rest) and rest["files"] == templates.FILES_COMING
@@ -338,7 +338,7 @@ def test_a_run_that_fails_or_is_stopped_keeps_the_earlier_result_named(
     kept = dict(screen.shows)
     run(desk, jobs, outcome, screen, filled=filled)
     status = screen.shows["status"]
-    assert notice in status and "Below: the earlier result of the first pair" in status
+    assert notice in status and "Below: the previous result, for the first pair" in status
     assert {**screen.shows, "status": ""} == {
         **kept,
         "status": "",
@@ -356,7 +356,7 @@ def test_a_stop_in_the_last_stage_discards_the_new_result(desk, jobs):
     screen = Screen(desk)
     run(desk, jobs, made_result(name="kept"), screen)
     run(desk, jobs, made_result(name="stopped"), screen, during=lambda: desk.stop(asks()))
-    assert "earlier result of kept" in screen.shows["status"] and "stopped" not in screen.shows["status"]
+    assert "previous result, for kept" in screen.shows["status"] and "stopped" not in screen.shows["status"]
     run(desk, jobs, made_result(name="next"), screen)
     assert "next" in screen.shows["status"] and "earlier" not in screen.shows["status"]
 
@@ -631,7 +631,7 @@ class Visit(RuleBasedStateMachine):
         assert found.html() in shows["readings"] and shows["scene_data"] == self.scene(result)
         assert shows["secret"] == self.desk.sessions.of("tab").secret
         idle = self.desk.sessions.of("tab").run is None
-        assert ("Below: the earlier result of" in shows["status"]) or idle
+        assert ("Below: the previous result, for" in shows["status"]) or idle
         assert (shows.get("progress", "") == "") == idle
         if "stop" in shows:
             assert shows["stop"]["interactive"] == (not idle)

@@ -237,7 +237,7 @@ def test_an_uncertain_scale_widens_every_length_alike():
     bare = replace(shown, confidence=None)
     assert bare.distance(*(bare.reading(pixel) for pixel in PIXELS[:2]))[1] == pytest.approx(0.2 * length)
     words = measured(shown, PIXELS[:2])
-    assert "± 20 % of the scale" in words.html() and metres(length, spread) in words.headline()
+    assert "± 20 % for the scale" in words.html() and metres(length, spread) in words.headline()
     assert "of the scale" not in measured(made_result(), PIXELS[:2]).html()
 
 

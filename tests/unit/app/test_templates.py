@@ -120,7 +120,7 @@ def test_the_banner_of_a_good_result_is_a_status_and_that_of_an_example_names_it
 def test_an_earlier_result_is_named_below_the_notice():
     html = templates.earlier(templates.STOPPED, made_result(name=HOSTILE))
     assert html.startswith(templates.STOPPED) and '<div class="earlier">' in html
-    assert f"Below: the earlier result of {ESCAPED}" in html and 'class="verdict caution"' in html
+    assert f"Below: the previous result, for {ESCAPED}" in html and 'class="verdict caution"' in html
 
 
 def test_scripts_styles_and_html_name_the_same_elements():

@@ -66,7 +66,7 @@ def test_one_mask_is_for_all_frames_and_may_have_another_scale(tmp_path):
     np.testing.assert_array_equal(
         capture.valid(frame.name), np.arange(width)[None].repeat(height, 0) < width // 2
     )
-    with pytest.raises(InputError, match="the mask of a must be of its image's 48x36 pixels; got 9x9"):
+    with pytest.raises(InputError, match="the mask of a must be 48x36 pixels, like its image; got 9x9"):
         Capture([replace(frame, mask=save(tmp_path / "m.png", np.ones((9, 9), bool)))], "one", "m", []).valid(
             "a"
         )

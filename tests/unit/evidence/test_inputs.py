@@ -377,7 +377,7 @@ def test_the_left_views_K_has_to_fit_its_image_unless_it_is_a_crop():
     off = KS[0].copy()
     off[1, 2] = 37.0  # of 36 rows, and within 48
     views = [(IMAGES[0], off, ES[0]), (IMAGES[1], KS[1], ES[1])]
-    with pytest.raises(InputError, match=r"K\[left\] has .* outside the left view's image of 48x36"):
+    with pytest.raises(InputError, match=r"K\[left\] has .* outside the left view's image \(48x36"):
         split_views(views)
     assert split_views(views, cropped=True).left_size == (48, 36)
     (found,) = codes_of(lambda: split_views([(with_exif(100.0), KS[0], ES[0]), views[1]]))
@@ -423,11 +423,11 @@ def test_left_images_in_every_form_of_a_batch():
         ),
         (
             [IMAGES[0], IMAGES[1]],
-            r"image\[1\] must be of 48x36 pixels, like image\[0\]; got 60x40. Use one call",
+            r"image\[1\] must be 48x36 pixels, like image\[0\]; got 60x40. Use one call",
         ),
         (
             [[IMAGES[0]], [IMAGES[0], IMAGES[2]]],
-            r"image\[1\]\[1\] must be of 48x36 pixels, like image\[0\]\[0\]; got 36x48",
+            r"image\[1\]\[1\] must be 48x36 pixels, like image\[0\]\[0\]; got 36x48",
         ),
         ([IMAGES[0], IMAGES[0].astype(float)], r"image\[1\] must be floats"),
         (IMAGES[0].astype(float), r"image must be floats"),

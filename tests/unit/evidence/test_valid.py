@@ -79,7 +79,7 @@ def test_a_mask_without_invalid_pixels_is_none():
 @pytest.mark.parametrize(
     ("value", "said"),
     [
-        (CIRCLE[:, 1:], "mask must be of its image's 160x120 pixels; got 159x120"),
+        (CIRCLE[:, 1:], "mask must be 160x120 pixels, like its image; got 159x120"),
         (np.zeros(SIZE), "mask must be white .* got no valid pixel"),
         ("mask.png", "mask must be a PIL image"),
         (np.zeros(3), r"mask must be .* got shape \(3,\)"),

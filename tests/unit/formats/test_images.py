@@ -361,7 +361,7 @@ def test_a_warning_points_at_the_line_that_gave_the_image():
         ),
         (
             lambda p: as_image_01(np.full((40, 40), np.nan), "the left"),
-            ("the left", "finite", "NaN or infinity in it", "Mask or fill"),
+            ("the left", "finite", "NaN or infinity", "Mask or fill"),
         ),
         (
             lambda p: as_image_01(np.full((40, 40), 7.0), "the left"),

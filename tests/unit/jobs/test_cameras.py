@@ -26,10 +26,10 @@ def test_a_calibration_is_for_images_of_its_size(files, tmp_path):
     pair = read_pair(base)
     assert pair.rig.E[0, 3] == pytest.approx(0.11) and pair.rig.rectified
     assert read_pair(replace(base, baseline=0.3)).rig.E[0, 3] == pytest.approx(0.3)
-    with pytest.raises(InputError, match=r"the right image \S*right.png must be of 54x40 pixels"):
+    with pytest.raises(InputError, match=r"the right image \S*right.png must be 54x40 pixels"):
         read_pair(replace(base, right=files / "right.png"))
     calib.write_text(text.format(width + 1))
-    with pytest.raises(InputError, match=r"the left image \S*left.png must be of 55x40 pixels"):
+    with pytest.raises(InputError, match=r"the left image \S*left.png must be 55x40 pixels"):
         read_pair(base)
 
 

@@ -150,7 +150,7 @@ def test_options_are_checked_before_the_prior_is_loaded(options, monkeypatch, ch
 def test_frames_of_another_size_than_the_calibration(options, textured_plane, pipe):
     small = np.hstack([textured_plane.left[:-8], textured_plane.right[:-8]])
     video = write_video(Path("small.avi"), [small])
-    with pytest.raises(InputError, match="the left image small.avi must be of"):
+    with pytest.raises(InputError, match="the left image small.avi must be [0-9]+x[0-9]+ pixels"):
         results_of(replace(options, source=(str(video),)), pipe=pipe)
 
 

@@ -137,7 +137,11 @@ def test_steep_edges_stay_steep_where_a_map_is_enlarged():
         (np.full(SIZE, np.nan), ValueError, "two different finite values"),
         (make_map() + 1j, ValueError, "depth_map must be a map"),
         ([make_map(), make_map()], ValueError, "one map .* for each of 1 images; got 2"),
-        (make_map(0, SIZE[::-1]), ValueError, "36x24 pixels; got 24x36 pixels. Is it transposed"),
+        (
+            make_map(0, SIZE[::-1]),
+            ValueError,
+            "36x24 pixels, like the image; got 24x36 pixels. Is it transposed",
+        ),
     ],
 )
 def test_a_non_map_of_the_image_is_rejected(pipe, given, error, words):

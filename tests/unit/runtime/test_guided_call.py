@@ -86,7 +86,7 @@ def test_what_a_pipeline_takes_is_accepted(changes):
         ),
         ({"generator": [torch.Generator()] * 5 + [3]}, "generator must be None"),
         ({"generator": 3}, "generator must be None, a torch.Generator or a list of them; got int"),
-        ({"latents": torch.tensor([0.0, torch.inf])}, "latents must be finite; got NaN or infinity in it"),
+        ({"latents": torch.tensor([0.0, torch.inf])}, "latents must be finite; got NaN or infinity"),
     ],
 )
 def test_what_no_pipeline_takes_is_rejected(changes, message):

@@ -154,7 +154,7 @@ def test_frames_of_another_size(rig, frame, side):
     height, width = frame.left.shape[:2]
     sized = rig.sized((width, height), (width, height))
     small = replace(frame, **{side: getattr(frame, side)[:-2]})
-    with pytest.raises(InputError, match=f"the {side} frame must be of {width}x{height} pixels"):
+    with pytest.raises(InputError, match=f"the {side} frame must be {width}x{height} pixels"):
         LiveRig(setup_of_rig(sized, FAST), CPU, check_every=2).prepare(small)
     live = LiveRig(setup_of_rig(rig, FAST), CPU, check_every=2)
     live.prepare(frame)

@@ -119,4 +119,4 @@ def test_unknown_motion_is_not_ruled_out():
 
 
 def test_the_finding_states_how_much_moved():
-    assert "35 % of the matches moved" in judged(good(Moved(0.3456)), "views.moved")
+    assert "35 % of the matches are on objects that moved" in judged(good(Moved(0.3456)), "views.moved")

@@ -77,7 +77,7 @@ def test_a_pose_of_another_pair_is_suspected_only_beyond_four_pixels(given_px, s
         (Uncertainty(math.inf, 0.0, True), ["is uncertain by 100 %"]),
         (
             Uncertainty(0.0956, LOG(1.1567), True),
-            ["its scale by 10 %", "changes depth by 16 % (median)"],
+            ["its scale may be off by 10 %", "changes depth by 16 % (median)"],
         ),
         (Uncertainty(None, LOG(1.2345), True), ["changes depth by 23 % (median)"]),
     ],
