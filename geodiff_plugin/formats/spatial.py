@@ -53,7 +53,7 @@ def _boxes(data: bytes) -> Iterator[_Box]:
             (size,), head = struct.unpack_from(">Q", data, start + 8), 16
         stop = start + size if size else len(data)
         if size and size < head or stop > len(data):
-            raise ValueError("a box of another size")
+            raise ValueError("a box with a wrong size")
         content = data[start + head : stop]
         if kind == b"uuid":
             kind = UUIDS.get(content[:16].hex(), kind)
