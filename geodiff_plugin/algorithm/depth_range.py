@@ -17,6 +17,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm.terms import Given, Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.affine import AffineState
 from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refine_to_matches
 from geodiff_plugin.scale.space import DepthRange, MetricMap, smooth_floor
@@ -84,7 +85,21 @@ def fit_depth_range(
     for target in (evidence.matches, evidence.points):
         if target is not None:
             near, far = refine_to_matches(floored, target, near, far, space)
-    if config.depth_range is not None:
-        low, high = config.depth_range
-        near, far = ordered(near.clamp(low, high), far.clamp(low, high))
-    return DepthRange(near, far, on_edge)
+    return DepthRange(*_within(near, far, config), on_edge)
+
+
+@torch.no_grad()
+def refit_depth_range(
+    x: Tensor, matches: Matches, metric: MetricMap, config: GuidanceConfig, current: DepthRange
+) -> DepthRange:
+    """Refine the ``current`` range of one image's maps ``x (B, 1, h, w)`` to its weighted matches."""
+    near, far = refine_to_matches(smooth_floor(x), matches, current.near_m, current.far_m, metric.space)
+    return DepthRange(*_within(near, far, config), current.on_edge)
+
+
+def _within(near: Tensor, far: Tensor, config: GuidanceConfig) -> tuple[Tensor, Tensor]:
+    """Clamp both ends to the given range, if any."""
+    if config.depth_range is None:
+        return near, far
+    low, high = config.depth_range
+    return ordered(near.clamp(low, high), far.clamp(low, high))

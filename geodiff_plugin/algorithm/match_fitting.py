@@ -110,12 +110,14 @@ def _affinities_along(axis: int, guide: Tensor, log_depth: Tensor) -> Tensor:
 
 
 def local_error(error: Tensor | None, valid: Tensor | None) -> Tensor | None:
-    """Return ``(B, 1, H, W)``: a prior's ``error (B, 1, 1, 1)`` where it gives a depth, else the maximum.
+    """Return ``(B, 1, H, W)``: a prior's ``error`` where it gives a depth, else the maximum.
 
+    ``error`` is ``(B, 1, 1, 1)``, or ``(B, 1, h, w)`` on any grid.
     ``valid (B, 1, H, W)`` is above 0 where the prior gives a depth; ``None`` returns ``error`` itself.
     """
     if error is None or valid is None:
         return error
+    error = _on_grid(error, image_size(valid))
     return torch.where(valid > 0, error, torch.full_like(error, MAX_PRIOR_ERROR))
 
 
@@ -232,11 +234,25 @@ def _spread(residual: Tensor, noise: Tensor, weight: Tensor, confidence: Tensor)
     return excess.view(-1, 1, 1, 1).clamp(MIN_PRIOR_ERROR, MAX_PRIOR_ERROR)
 
 
-@torch.no_grad()
+class MeasuredError(NamedTuple):
+    """A prior's error, and the held-out matches' deviations that it was measured from."""
+
+    error: Tensor  # (B, 1, 1, 1) log depth, in [``MIN_PRIOR_ERROR``, ``MAX_PRIOR_ERROR``]
+    deviation: Tensor  # (B, 1, h, w), log inverse depth predicted from the other blocks minus the match's
+
+
 def prior_error(
     depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig = DEFAULT
 ) -> Tensor:
-    """Measure a prior's error in log depth, ``(B, 1, 1, 1)`` in [``MIN_PRIOR_ERROR``, ``MAX_PRIOR_ERROR``].
+    """Return the error ``(B, 1, 1, 1)`` of ``measure_error``."""
+    return measure_error(depth_m, target, left_01, config).error
+
+
+@torch.no_grad()
+def measure_error(
+    depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig = DEFAULT
+) -> MeasuredError:
+    """Measure a prior's error from matches.
 
     Cross-validation: matches are held out in blocks and predicted from the other blocks by the prior's map
     under a stiff fit. This measures the map between matches, not how well it can be bent to them. Arguments
@@ -252,11 +268,11 @@ def prior_error(
     first = _spread(*observed[:4])
     trusted = torch.cat([weight_of_black, observed.weight - weight_of_black])
     of_black, of_white = _stiff(observed, trusted, first, config).field.chunk(2)
-    held_out_error = torch.where(black, of_white, of_black) - observed.residual
-    error = _spread(held_out_error, *observed[1:4])
+    deviation = torch.where(black, of_white, of_black) - observed.residual
+    error = _spread(deviation, *observed[1:4])
     count = (observed.weight > 0).sum((1, 2, 3), keepdim=True, dtype=torch.float32)
     fraction = (count / FEW_POINTS).clamp_max(1.0)
-    return error**fraction * MAX_PRIOR_ERROR ** (1.0 - fraction)
+    return MeasuredError(error**fraction * MAX_PRIOR_ERROR ** (1.0 - fraction), deviation)
 
 
 class DepthFit(NamedTuple):

@@ -23,7 +23,7 @@ class Member:
     near_m: Tensor  # (1, 1, 1, 1) metres, nearest pixel of the map; resampling may overshoot it
     far_m: Tensor  # (1, 1, 1, 1) metres, farthest pixel
     match_weight: Tensor | None  # (1, 1, h, w) factor on the confidence of matches, 0 for reflections
-    error: Tensor | None  # (1, 1, 1, 1) error of the prior in log depth, where it is valid
+    error: Tensor | None  # (1, 1, 1, 1) or (1, 1, h, w) error of the prior in log depth, where it is valid
     valid: Tensor | None  # (1, 1, h, w) bool, where the prior gives a depth; ``None``: everywhere
     rank_correlation: Tensor | None  # (1,) of the prior's first map with matches or points; NaN for too few
     on_edge: Tensor | None  # (1,) bool, whether the scale search ended at the edge of its range

@@ -13,8 +13,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.depth_range import fit_depth_range, search_one_number, span_of_points
-from geodiff_plugin.algorithm.match_fitting import fit_depth, fit_target, local_error, prior_error
+from geodiff_plugin.algorithm.depth_range import (
+    fit_depth_range,
+    refit_depth_range,
+    search_one_number,
+    span_of_points,
+)
+from geodiff_plugin.algorithm.map_error import regional_error
+from geodiff_plugin.algorithm.match_fitting import fit_depth, fit_target, local_error, measure_error
 from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.algorithm.optimizers import OPTIMIZERS, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.terms import Given, Loss, Objective
@@ -27,6 +33,9 @@ from geodiff_plugin.scale.affine import AffineState
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.scale.space import DepthRange, MetricMap, PriorMaps, cat_samples
 from geodiff_plugin.types import StepReport
+
+#: Number of times that the scale of a given map is refined without reflections: each finds further ones.
+REFITS = 2
 
 
 def _samples_of_images(image_of_sample: Sequence[int]) -> list[slice]:
@@ -82,7 +91,7 @@ class Trajectory:
     affine: AffineState  # after the latest update; set by ``find_scale``
     match_weight: Tensor | None = None  # (B, 1, H, W), factor on the confidence of matches
     certainty: Tensor | None = None  # (B, 1, H, W), ``Settled.certainty`` of the first estimate
-    error: Tensor | None = None  # (B, 1, 1, 1), ``match_fitting.prior_error`` of the first estimate
+    error: Tensor | None = None  # (B, 1, 1, 1), ``prior_error`` of the first estimate; per pixel if given
     occluded: Tensor | None = None  # (B, V, 1, H, W) bool, pixels occluded in the right views
     rank_correlation: Tensor | None = None  # (B,), of the prior's first map with matches or points
     prior_depth_m: Tensor | None = None  # (B, 1, h, w) metres, a metric prior's first estimate
@@ -182,17 +191,49 @@ class Trajectory:
         """At the first estimate, find matches that look like reflections and measure the prior's error."""
         if self.error is not None or (self.matches is None and self.points is None):
             return
-        depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         if self.matches is not None and self.match_weight is None:
-            self.match_weight = self._weight_by_reflections(self.matches, depth_m)
-            if (settled := settle(self.matches, depth_m)) is not None:
-                self.match_weight = self.match_weight * settled.weight
-                self.certainty = settled.certainty
+            self._weigh_matches(self.matches, x)
+            if self.maps.given and self.config.search == "volume":
+                for _ in range(REFITS):
+                    self._refit_scale(x)
+                    self._weigh_matches(self.matches, x)
         if self.config.fit_matches or self.config.refine_edges:
-            target = self._target(depth_m)
-            assert target is not None  # there are matches or points
-            target = target if self.maps.valid is None else target.within(self.maps.valid)
-            self.error = prior_error(depth_m, target, self.objective.left_01, self.config)
+            self.error = self._measure_error(self.objective.metric_depth(x, self.affine))
+
+    def _weigh_matches(self, matches: Matches, x: Tensor) -> None:
+        """Find the matches that are reflections of the estimate ``x``, or off by a period of a pattern."""
+        depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
+        self.match_weight = self._weight_by_reflections(matches, depth_m)
+        if (settled := settle(matches, depth_m)) is not None:
+            self.match_weight = self.match_weight * settled.weight
+            self.certainty = settled.certainty
+
+    def _refit_scale(self, x: Tensor) -> None:
+        """Refine the scale of given maps with the weights of the matches; synchronizes with the device.
+
+        A sky that a map places too near is fitted at first, and shifts all other depths.
+        """
+        assert self.match_weight is not None  # set by _weigh_matches
+        current, ranges = DepthRange(*self.metric.range_of(self.affine), self.on_edge), []
+        for samples, evidence in zip(self._images, self._valid_evidence, strict=True):
+            assert evidence.matches is not None  # every image has matches
+            confidence = self.match_weight[samples.start] * evidence.matches.confidence
+            matches = replace(evidence.matches, confidence=confidence)
+            of_image = x[samples], matches, self.metric, self.config, current.of(samples)
+            ranges.append(refit_depth_range(*of_image))
+        near_m, far_m, _ = zip(*ranges, strict=True)
+        self.affine = self._affine_start = self.metric.from_range(cat_samples(near_m), cat_samples(far_m))
+
+    def _measure_error(self, depth_m: Tensor) -> Tensor:
+        """Measure the prior's error, ``(B, 1, 1, 1)``, or ``(B, 1, H, W)`` for a given map and two views."""
+        target = self._target(depth_m)
+        assert target is not None  # there are matches or points
+        target = target if self.maps.valid is None else target.within(self.maps.valid)
+        measured = measure_error(depth_m, target, self.objective.left_01, self.config)
+        volumes = [evidence.volume for evidence in self.evidence if evidence.volume is not None]
+        if not self.maps.given or self.matches is None or len(volumes) < len(self.evidence):
+            return measured.error
+        return regional_error(measured, target, volumes)
 
     def _weight_by_reflections(self, matches: Matches, depth_m: Tensor) -> Tensor:
         """Return the factor ``(B, 1, H, W)`` on the confidence of matches that removes reflections."""

@@ -36,6 +36,17 @@ class CostVolume:
         row, column = index // self.size[1], index % self.size[1]
         return self.levels[:, row, column].float() / COST_LEVELS, self.in_view[:, row, column]
 
+    def cost_at(self, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the lower cost in [0, 1] of the two planes around ``inverse_depth (1, H, W)``, 1/m.
+
+        The second map states whether a right view sees the pixel on both planes.
+        """
+        position = (inverse_depth - float(self.inverse_depth[0])) / float(self.plane_step)
+        below = position.floor().long().clamp(0, len(self.levels) - 2)
+        planes = torch.cat([below, below + 1])
+        cost = self.levels.gather(0, planes).amin(0, keepdim=True) / COST_LEVELS
+        return cost, self.in_view.gather(0, planes).all(0, keepdim=True)
+
     @property
     def guide(self) -> Tensor:
         """``(H, W)`` of ``left_01`` for the paths of the aggregation, NaN where a pixel is not valid."""

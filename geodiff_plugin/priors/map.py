@@ -44,6 +44,8 @@ class DepthMapPipeline(DirectMapPipeline):
     ``processing_resolution`` is the longer side of the guided map, 0 for the image's own size.
     """
 
+    takes_map = True
+
     def __init__(
         self,
         scheduler: DirectScheduler,

@@ -79,6 +79,7 @@ class DepthPrior:
             runs the rounds of all steps within the allowed ones.
         deterministic: whether the same image always gives the same map, so that an ensemble has one member.
         takes_prompt: whether the call takes ``prompt_depth``, depths that the network starts from.
+        takes_map: whether the call takes ``depth_map``, the user's map, which is the result without guidance.
         depth_channels: depth channels of the scheduler's latents; guidance does not change the others.
         metric_range: for a metric prior, ``(N * E, 2)`` metres at 0 and at 1 of its maps; else ``None``.
         valid: ``(N * E, 1, H, W)`` bool, pixels of the processing grid with a prior depth; ``None`` for all.
@@ -88,6 +89,7 @@ class DepthPrior:
     max_steps: int | None = None
     deterministic = False
     takes_prompt = False
+    takes_map = False
     depth_channels = slice(None)
     metric_range: Tensor | None = None
     valid: Tensor | None = None
@@ -103,7 +105,8 @@ class DepthPrior:
         depth_range = None
         if self.metric_range is not None:  # nearest first, which is at x = 1 in disparity
             depth_range = DepthRange(*self.metric_range[samples].T.sort(0).values)
-        return PriorMaps(self.space, None if self.valid is None else self.valid[samples], depth_range)
+        valid = None if self.valid is None else self.valid[samples]
+        return PriorMaps(self.space, valid, depth_range, self.takes_map)
 
     @property
     def network_input(self) -> slice | None:

@@ -77,6 +77,7 @@ class PriorMaps:
     space: str  # space in which the maps are affine, key of ``SPACES``
     valid: Tensor | None = None  # (B, 1, h, w) bool, where the maps are defined; ``None``: everywhere
     depth_range: DepthRange | None = None  # of a metric prior
+    given: bool = False  # whether the maps are the user's, and the same at every step
 
 
 @dataclass(frozen=True)

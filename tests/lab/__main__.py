@@ -15,20 +15,29 @@ from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.cli.eval import LIST, run_and_show
 from geodiff_plugin.evaluation.options import COMMANDS
 from geodiff_plugin.options import Command
-from tests.lab.options import SequenceOptions, StrengthOptions, SurfacesOptions, TrustOptions
+from tests.lab.options import (
+    PriorMapsOptions,
+    SequenceOptions,
+    StrengthOptions,
+    SurfacesOptions,
+    TrustOptions,
+)
 
 PROGRAM = "python -m tests.lab"
 
 
 def _run(name: str, options: Any) -> Any:
     """Run an experiment: ``run`` of the module with its name."""
-    return importlib.import_module(f"tests.lab.{name}").run(name, options)
+    return importlib.import_module(f"tests.lab.{name.replace('-', '_')}").run(name, options)
 
 
 #: Experiments; each is a module of this package with its name.
 EXPERIMENTS = {
     "strength": Command(
         StrengthOptions, partial(_run, "strength"), "Effect of prior quality, with emulated priors."
+    ),
+    "prior-maps": Command(
+        PriorMapsOptions, partial(_run, "prior-maps"), "Guided calls with depth maps that have errors."
     ),
     "surfaces": Command(
         SurfacesOptions,

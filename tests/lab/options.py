@@ -37,6 +37,23 @@ STRENGTHS = {
     "gamma": Strength(0.0, gamma=1.6),
 }
 STRENGTH_METHODS = ("prior-aligned", "prior-fit", "guided", "search-only", "guided:guidance_steps=5")
+
+
+class MapError(NamedTuple):
+    """Error of a depth map that is otherwise the ground truth."""
+
+    far: float = 1.0  # factor on depth beyond the median
+    smooth: float = 0.0  # standard deviation of a smooth field, log depth
+    patches: float = 0.0  # standard deviation of the patches over 30 % of the image, log depth
+
+
+MAP_ERRORS = {
+    "far": MapError(far=0.9),
+    "smooth5": MapError(smooth=0.05),
+    "smooth10": MapError(smooth=0.1),
+    "smooth15": MapError(smooth=0.15),
+    "patches": MapError(patches=0.4),
+}
 #: Ways to process a sequence, and the titles of their rows.
 WAYS = {
     "alone": "independent",
@@ -66,6 +83,24 @@ class StrengthOptions(OutOptions):
     )
     steps: int | None = count_of(4, "Number of denoising steps.", high=1000)
     resolution: int = count_of(384, "Longer side of the prior's input in pixels.", 64, 8192)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriorMapsOptions(EvalOptions):
+    """Options of ``prior-maps``: guided calls with depth maps that have errors."""
+
+    data: tuple[Path, ...] = folder_of(
+        "Folder of data sets, or the name of a registered data set; repeatable.", default=()
+    )
+    scenes: tuple[str, ...] = listed(
+        (), "Only pairs whose names contain one of these words, separated by commas."
+    )
+    limit: int | None = count_of(None, "Maximum number of pairs of each --data, from the first.")
+    errors: tuple[str, ...] = some_of(MAP_ERRORS)
+    maps: tuple[str, ...] = listed(
+        (), "Folders of further maps, DIR or KIND:DIR as in the method prior-map, separated by commas."
+    )
+    out: Path = out_folder("geodiff-prior-maps")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -160,6 +160,7 @@ def _run_reprojection(sample: StereoSample, settings: Settings, priors: PriorCac
 class RampPrior(DepthMapPipeline):
     """Predicts the latent of a ground plane, near at the bottom, in one step with a prior's ``adapter``."""
 
+    takes_map = False
     adapter: Any
 
     def prepare_condition(self, image: Tensor, ensemble_size: int, *_: Any, **__: Any) -> dict[str, Tensor]:

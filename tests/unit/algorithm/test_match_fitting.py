@@ -245,6 +245,10 @@ def test_a_prior_has_the_largest_error_where_it_gives_no_depth():
     found = local_error(error, valid)
     np.testing.assert_array_equal(found.numpy(), np.where(valid, error.numpy(), np.float32(0.5)))
     assert local_error(error, None) is error and local_error(None, valid) is None
+    per_pixel = drawn(2, 1, 8, 12, seed=2)
+    found = local_error(per_pixel, valid)
+    nearest = F.interpolate(per_pixel, (4, 6), mode="nearest-exact")
+    np.testing.assert_array_equal(found.numpy(), np.where(valid, nearest, np.float32(0.5)))
 
 
 def test_what_a_map_is_fitted_to():

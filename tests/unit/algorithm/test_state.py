@@ -43,8 +43,8 @@ from geodiff_plugin.result import median
 from geodiff_plugin.result.expected_error import MATCH_NOISE_PX, expected_error
 from geodiff_plugin.result.median import filter_depth
 from geodiff_plugin.scale.affine import AffineState
-from geodiff_plugin.scale.points import reliable_matches
-from geodiff_plugin.scale.space import DepthRange, PriorMaps
+from geodiff_plugin.scale.points import refine_to_matches, reliable_matches
+from geodiff_plugin.scale.space import DepthRange, PriorMaps, smooth_floor
 from tests.tiny import rows_of
 from tests.views import view_of
 
@@ -133,13 +133,16 @@ Z0 = drawn(4, 4, 9, 12, seed=80)
 NAMES = ("match_weight", "error", "rank_correlation", "prior_depth_m", "on_edge", "occluded")
 
 
-def run(images=IMAGE_OF_SAMPLE, samples=slice(None), config=CONFIG, evidence=None, **maps) -> Trajectory:
+def run(
+    images=IMAGE_OF_SAMPLE, samples=slice(None), config=CONFIG, evidence=None, given=False, **maps
+) -> Trajectory:
     """A trajectory of some of the samples that was prepared, and had its hidden pixels found."""
     x, known = maps_of(**maps)
-    given = [evidence_of(image) for image in range(3)] if evidence is None else evidence
+    evidence = [evidence_of(image) for image in range(3)] if evidence is None else evidence
     of_range = known.depth_range and known.depth_range.of(samples)
     valid = None if known.valid is None else known.valid[samples]
-    trajectory = Trajectory(config, given, images[samples], PriorMaps(known.space, valid, of_range), 0.1)
+    of_prior = PriorMaps(known.space, valid, of_range, given)
+    trajectory = Trajectory(config, evidence, images[samples], of_prior, 0.1)
     trajectory.x = x[samples]
     trajectory.prepare(trajectory.x, Z0[samples])
     trajectory.find_occluded(trajectory.x)
@@ -232,6 +235,43 @@ def test_what_is_found_of_the_first_estimate_is_what_its_stages_find(valid):
     given = state.Given(trajectory.affine, trajectory.affine, Z0, Z0, of_matches, points, occluded)
     expected = trajectory.objective(x, given)
     torch.testing.assert_close(loss.total, expected.total)
+
+
+def test_the_scale_of_a_given_map_is_refined_without_reflections():
+    networks, given = run(valid=False), run(valid=False, given=True)
+    ranges = torch.stack(networks.metric.range_of(networks.affine), 1)
+    matches = [evidence_of(image).matches for image in IMAGE_OF_SAMPLE]
+    weight = networks.match_weight
+    for _ in range(2):
+        ends = []
+        for b, image in enumerate(IMAGE_OF_SAMPLE):
+            first = weight[IMAGE_OF_SAMPLE.index(image)]  # of the image's samples
+            weighted = replace(matches[b], confidence=first * matches[b].confidence)
+            x = smooth_floor(given.x[b : b + 1])
+            ends.append(torch.cat(refine_to_matches(x, weighted, *ranges[b : b + 1].T, "disparity")))
+        ranges = torch.stack(ends)
+        depth_m = given.objective.metric_depth(given.x, given.metric.from_range(*ranges.T))
+        weight = reject_reflections(Matches.stack(matches), depth_m)
+    found = torch.stack(given.metric.range_of(given.affine), 1)
+    torch.testing.assert_close(found, ranges, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(given.match_weight, weight, rtol=1e-2, atol=1e-2)
+    assert (found / torch.stack(networks.metric.range_of(networks.affine), 1)).log().abs().max() > 2e-3
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_only_a_given_map_has_an_error_per_pixel(monkeypatch, given):
+    trajectory = run(valid=False, given=given)
+    depth_m = trajectory.objective.metric_depth(trajectory.x, trajectory.affine)
+    of_all, trajectory.error = trajectory.error, None
+    assert of_all.shape == (4, 1, 1, 1)  # there is no volume
+    trajectory.evidence = [replace(each, volume=str(b)) for b, each in enumerate(trajectory.evidence)]
+    monkeypatch.setattr(state, "regional_error", lambda measured, target, volumes: (measured, volumes))
+    error = trajectory._measure_error(depth_m)
+    if given:
+        measured, volumes = error
+        assert volumes == list("0123") and measured.deviation.shape == (4, 1, *GRID)
+        error = measured.error
+    torch.testing.assert_close(error, of_all)
 
 
 @pytest.mark.parametrize(

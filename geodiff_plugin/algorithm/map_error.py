@@ -1,0 +1,89 @@
+"""Finds where a given depth map is wrong: in regions whose matches explain the images better than the map.
+
+One error for the whole map would reject the correct matches of such a region as outliers. Residuals alone
+cannot separate a wrong map from wrong matches, because both are smooth in a region. The images can: a wrong
+match in an occluded, textureless or repetitive region has no lower matching cost than the map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin.algorithm.constants import MAX_PRIOR_ERROR, MIN_PRIOR_ERROR
+from geodiff_plugin.algorithm.match_fitting import MeasuredError
+from geodiff_plugin.matching import CostVolume, Matches
+from geodiff_plugin.matching.consistency import window_mean
+
+#: Cost of the map minus the match's, as a fraction of the maximum cost, at which a match begins to
+#: contradict the map, and at which it does.
+EXCESS_COST = 0.03, 0.1
+#: Fraction of a window's confidence in contradicting matches at which the map begins to be wrong there, and
+#: at which it is. Lower ones include the matches that extend a near surface beyond its edge.
+CONTRADICTED = 0.25, 0.5
+#: Error of a region over the map's at which it begins to replace the map's, and at which it does.
+LARGER = 2.0, 4.0
+#: Half side of that window, as a fraction of the longer image side: half a held-out block.
+WINDOW = 0.04
+#: Confidence of a window that is added to its matches', so that a few matches contradict nothing.
+PRIOR_CONFIDENCE = 0.2
+#: Ratio of the contradicted areas with matches in front of the map and behind it, below which the matches
+#: behind count less. A wrong map has both; transparent and reflecting surfaces have only matches behind.
+FRONT_RATIO = 0.5
+#: Bound of residuals, log depth.
+LARGEST = 1.0
+#: Standard deviation of a normal distribution over its mean absolute value.
+SD_PER_MEAN = math.sqrt(math.pi / 2.0)
+
+
+def _ramp(x: Tensor, ends: tuple[float, float]) -> Tensor:
+    """Rise from 0 to 1 between two ends."""
+    return ((x - ends[0]) / (ends[1] - ends[0])).clamp(0.0, 1.0)
+
+
+@torch.no_grad()
+def regional_error(measured: MeasuredError, target: Matches, volumes: Sequence[CostVolume]) -> Tensor:
+    """Raise a map's error ``(B, 1, h, w)``, log depth, in the regions where the images contradict the map.
+
+    The compared map is the one that the matches of other blocks predict, so an error that a fit corrects over
+    wide regions contradicts nothing. A contradicted region has the standard deviation of its contradicting
+    matches, if it is larger; other pixels keep ``measured.error``.
+
+    Args:
+        measured: ``measure_error`` of the map with these matches.
+        target: matches ``(B, 1, h, w)``.
+        volumes: cost volume of every sample, on the grid of the matches.
+    """
+    confidence, deviation = target.confidence.clamp_max(1.0), measured.deviation
+    against = confidence * _contradiction(deviation, target, volumes)
+    in_front = against * (deviation < 0)
+    size = deviation.abs().clamp_max(LARGEST)
+    radius = max(1, round(WINDOW * max(target.size)))
+    layers = torch.cat([against, in_front, against * size, confidence], 1)
+    against, in_front, size, total = window_mean(layers, radius).split(1, 1)
+    local = (SD_PER_MEAN * size / against.clamp_min(1e-6)).clamp(MIN_PRIOR_ERROR, MAX_PRIOR_ERROR)
+    larger = _ramp(local / measured.error, LARGER)
+    every, front, behind = (
+        larger * _ramp(part / (total + PRIOR_CONFIDENCE), CONTRADICTED)
+        for part in (against, in_front, against - in_front)
+    )
+    front_area, behind_area = ((part * confidence).mean((2, 3), keepdim=True) for part in (front, behind))
+    counted = (front_area / (FRONT_RATIO * behind_area).clamp_min(1e-6)).clamp_max(1.0)
+    wrong = torch.where(behind > front, every * counted, every)
+    return measured.error * (local / measured.error).clamp_min(1.0) ** wrong
+
+
+def _contradiction(deviation: Tensor, target: Matches, volumes: Sequence[CostVolume]) -> Tensor:
+    """Compute how clearly each match explains the images better than the map, ``(B, 1, h, w)`` in [0, 1].
+
+    It is 0 where the map's depth is outside every right view.
+    ``deviation`` is the log inverse depth of the map minus the match's.
+    """
+    matched, found = target.inverse_depth, []
+    for volume, of_match, of_map in zip(volumes, matched, matched * deviation.exp(), strict=True):
+        cost, is_seen = volume.cost_at(of_map)
+        found.append(_ramp(cost - volume.cost_at(of_match)[0], EXCESS_COST) * is_seen)
+    return torch.stack(found)
