@@ -27,6 +27,8 @@ from tests.mutation.worker import KILLED, SURVIVED, TIMED_OUT, Outcome, prepare,
 
 FOLDER = ROOT / ".mutation"
 EQUIVALENT = "equivalent"
+#: Longest name of a file of results, without its suffix.
+MAX_NAME = 100
 
 
 def main(arguments: list[str]) -> int:
@@ -70,9 +72,10 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def _name(options: argparse.Namespace) -> str:
-    """File of the results: one per draw."""
+    """File of the results: one per draw. Many words are abbreviated, as file systems limit names."""
     parts = [f"seed-{options.seed}", *options.only, *(["changed"] if options.changed else [])]
-    return "-".join(parts).replace("/", "_")
+    name = "-".join(parts).replace("/", "_")
+    return name if len(name) <= MAX_NAME else f"{name[:40]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def _key(mutant: Mutant) -> str:
