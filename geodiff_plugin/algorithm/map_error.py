@@ -57,7 +57,8 @@ def regional_error(measured: MeasuredError, target: Matches, volumes: Sequence[C
         target: matches ``(B, 1, h, w)``.
         volumes: cost volume of every sample, on the grid of the matches.
     """
-    confidence, deviation = target.confidence.clamp_max(1.0), measured.deviation
+    confidence = target.confidence.clamp_max(1.0)
+    deviation = measured.deviation
     against = confidence * _contradiction(deviation, target, volumes)
     in_front = against * (deviation < 0)
     size = deviation.abs().clamp_max(LARGEST)
@@ -82,7 +83,8 @@ def _contradiction(deviation: Tensor, target: Matches, volumes: Sequence[CostVol
     It is 0 where the map's depth is outside every right view.
     ``deviation`` is the log inverse depth of the map minus the match's.
     """
-    matched, found = target.inverse_depth, []
+    matched = target.inverse_depth
+    found = []
     for volume, of_match, of_map in zip(volumes, matched, matched * deviation.exp(), strict=True):
         cost, is_seen = volume.cost_at(of_map)
         found.append(_ramp(cost - volume.cost_at(of_match)[0], EXCESS_COST) * is_seen)

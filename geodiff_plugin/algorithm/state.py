@@ -214,7 +214,8 @@ class Trajectory:
         A sky that a map places too near is fitted at first, and shifts all other depths.
         """
         assert self.match_weight is not None  # set by _weigh_matches
-        current, ranges = DepthRange(*self.metric.range_of(self.affine), self.on_edge), []
+        current = DepthRange(*self.metric.range_of(self.affine), self.on_edge)
+        ranges = []
         for samples, evidence in zip(self._images, self._valid_evidence, strict=True):
             assert evidence.matches is not None  # every image has matches
             confidence = self.match_weight[samples.start] * evidence.matches.confidence
