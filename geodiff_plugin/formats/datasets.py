@@ -156,7 +156,7 @@ def read_log(path: Path) -> Layout | None:
 
 
 def _log_of_rows(file: Path, rows: list[list[str]]) -> Layout | None:
-    """Return the frames of a file with these rows; ``None`` if they are not those of a log with poses."""
+    """Return the frames of a file with these rows; ``None`` unless it is a log with poses."""
     frames = [rows[first : first + LOG_ROWS] for first in range(0, len(rows), LOG_ROWS)]
     heads = [frame[0] for frame in frames]
     bodies = [list(chain(*frame[1:])) for frame in frames]

@@ -83,7 +83,7 @@ def _row_if_complete(folder: Path, report: dict[str, Any]) -> Row | None:
 
 
 def _changed_inputs(options: DepthOptions, report: dict[str, Any]) -> list[str]:
-    """Return the input files whose content differs from that of a report, if it states their digests."""
+    """Return the input files whose content has changed since a report, if it states their digests."""
     digests = report.get("pair", {}).get("sha256", {})
     return [path for path, digest in file_digests(options).items() if digests.get(path, digest) != digest]
 

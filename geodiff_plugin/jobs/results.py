@@ -23,7 +23,7 @@ BENCHMARKS = {
 
 
 def _mapped_depth(path: Path) -> np.ndarray:
-    """Check the depth map of a frame and map its file, because those of a long video exceed the memory."""
+    """Check and memory-map the depth map of a frame, because the maps of a long video exceed the memory."""
     file = formats.check_file(path, "FRAME", "a folder of geodiff depth or a .npy")
     expected = "a depth map (H, W) of floats in metres"
     depth_m = read_npy(file, "FRAME", expected)
