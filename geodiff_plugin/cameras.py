@@ -41,6 +41,8 @@ ANGLE_TOLERANCE = 1e-3
 SIDEWAYS_TOLERANCE = 0.01
 #: Maximum reprojection error of a ray from OpenCV's undistortion, pixels.
 LENS_TOLERANCE_PX = 0.01
+#: Models of ``Distortion`` that OpenCV computes; pycolmap computes all others.
+OPENCV_LENSES = ("opencv", "fisheye")
 #: A resized pixel is valid if valid pixels make up at least this fraction of it.
 ALL_VALID = 0.999
 
@@ -317,31 +319,35 @@ def is_rectified(left: Camera, right: Camera, T_right_from_left: np.ndarray) -> 
 
 def _undistort(px: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
     """Undistort pixels ``(..., 2)`` as in ``Camera.undistorted_px``."""
-    taken = np.asarray(px, np.float64).reshape(-1, 1, 2)
+    distorted = np.asarray(px, np.float64).reshape(-1, 2)
     K = np.asarray(K, np.float64)
-    if not len(taken):
-        return taken.reshape(px.shape)
-    if lens.model in ("opencv", "fisheye"):
-        corrected = _undistort_by_opencv(taken, K, lens)
-    else:
-        rays = _colmap_camera(K, lens).cam_from_img(taken[:, 0] + 0.5)
-        corrected = rays @ K[:2, :2].T + K[:2, 2]  # NaN without a ray
-    return corrected.reshape(px.shape)
+    if not len(distorted):
+        return distorted.reshape(px.shape)
+    undistort = _undistort_by_opencv if lens.model in OPENCV_LENSES else _undistort_by_colmap
+    return undistort(distorted, K, lens).reshape(px.shape)
 
 
-def _undistort_by_opencv(taken: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
-    """Undistort ``(N, 1, 2)`` to ``(N, 2)`` with OpenCV, whose search can return a ray of another pixel."""
+def _undistort_by_opencv(distorted: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
+    """Undistort pixels ``(N, 2)`` with OpenCV, whose search can return a ray of another pixel."""
     import cv2
 
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9)
     coefficients = np.asarray(lens.coefficients, np.float64)
+    points = distorted[:, None]
     if lens.model == "fisheye":
-        corrected = cv2.fisheye.undistortPoints(taken, K, coefficients, R=np.eye(3), P=K, criteria=until)
+        corrected = cv2.fisheye.undistortPoints(points, K, coefficients, R=np.eye(3), P=K, criteria=until)
     else:
-        corrected = cv2.undistortImagePoints(taken, K, coefficients, None, until)
+        corrected = cv2.undistortImagePoints(points, K, coefficients, None, until)
     rays = np.stack(rays_of_pixels(K, corrected[:, 0, 0], corrected[:, 0, 1]), -1)
-    off_px = np.abs(_distort(rays, K, lens) - taken[:, 0]).max(1, keepdims=True)
+    off_px = np.abs(_distort(rays, K, lens) - distorted).max(1, keepdims=True)
     return np.where(off_px < LENS_TOLERANCE_PX, corrected[:, 0], np.nan)
+
+
+def _undistort_by_colmap(distorted: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
+    """Undistort pixels ``(N, 2)`` with pycolmap, which returns NaN without a ray."""
+    distorted_rays = np.stack(rays_of_pixels(K, distorted[:, 0], distorted[:, 1]), -1)
+    rays = _colmap_camera(lens).cam_from_img(distorted_rays)
+    return np.stack(pixels_of_rays(K, rays[:, 0], rays[:, 1]), -1)
 
 
 def _distort(flat: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
@@ -360,16 +366,20 @@ def _distort(flat: np.ndarray, K: np.ndarray, lens: Distortion) -> np.ndarray:
         none = np.zeros(3)
         px = cv2.projectPoints(points, none, none, K, coefficients)[0]
     else:
-        px = _colmap_camera(K, lens).img_from_cam(np.c_[rays, np.ones(len(rays))]) - 0.5
+        distorted_rays = _colmap_camera(lens).img_from_cam(np.c_[rays, np.ones(len(rays))])
+        px = np.stack(pixels_of_rays(K, distorted_rays[:, 0], distorted_rays[:, 1]), -1)
     return px.reshape(flat.shape)
 
 
-def _colmap_camera(K: np.ndarray, lens: Distortion) -> Any:
-    """Convert the camera to pycolmap, whose first pixel centre is (0.5, 0.5)."""
+def _colmap_camera(lens: Distortion) -> Any:
+    """Return pycolmap's camera with the identity as K, which distorts and undistorts rays.
+
+    K stays outside, because some models have one focal length, and resized images have different fx and fy.
+    """
     with keeping_sigterm():
         import pycolmap
 
     camera = pycolmap.Camera.create_from_model_name(1, lens.model, 1.0, 1, 1)
-    focals = (K[0, 0], K[1, 1])[: len(camera.focal_length_idxs())]
-    camera.params = [*focals, K[0, 2] + 0.5, K[1, 2] + 0.5, *lens.coefficients]
+    focals = [1.0] * len(camera.focal_length_idxs())
+    camera.params = [*focals, 0.0, 0.0, *lens.coefficients]
     return camera

@@ -85,6 +85,14 @@ def check_calibrated_size(
 def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -> None:
     """Raise an error if a camera matrix cannot belong to an image ``(H, W)``; warn if it is implausible."""
     height, width = size
+    _check_focal_unit(K, width, height, name, image)
+    check_intrinsics_fit(K, width, height, name, image)
+    _warn_of_principal_point(K, width, height, name, image)
+    _warn_of_aspect_ratio(K, name)
+
+
+def _check_focal_unit(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
+    """Raise an error if fx is so short that it can only be in another unit than pixels."""
     if K[0, 0] < NORMALISED * width:
         hint = (
             "If fx is in millimetres, multiply it by image width / sensor width, with the sensor width in "
@@ -93,16 +101,26 @@ def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -
         )
         expected = f"in pixels of {image} ({width}x{height})"
         bad_value(name, expected, f"fx = {K[0, 0]:g}", hint, code="camera.focal-unit")
-    check_intrinsics_fit(K, width, height, name, image)
-    x, y = K[0, 2] / width, K[1, 2] / height
-    place = ""
-    if min(x, y) < NEAR_BORDER or max(x, y) > 1.0 - NEAR_BORDER:
+
+
+def _warn_of_principal_point(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
+    """Warn if the principal point suggests that a camera matrix is for an image of another size."""
+    cx, cy = K[0, 2], K[1, 2]
+    x, y = cx / width, cy / height
+    is_near_border = min(x, y) < NEAR_BORDER or max(x, y) > 1.0 - NEAR_BORDER
+    is_scaled = min(abs(x - 0.5), abs(y - 0.5)) > OFF_MIDDLE and abs(x - y) < NEARLY_ALIKE
+    if is_near_border:
         place = f"near the border of {image} ({width}x{height} pixels)"
-    elif min(abs(x - 0.5), abs(y - 0.5)) > OFF_MIDDLE and abs(x - y) < NEARLY_ALIKE:
+    elif is_scaled:
         place = f"where it would be in an image {x + y:.2g} times the size of {image}"
-    if place:
-        at = f"{name} has its principal point at ({K[0, 2]:.1f}, {K[1, 2]:.1f}), {place}"
-        warn(Finding("camera.principal-point", f"{at}. If {name} is for another resolution, {SCALED_K}."))
+    else:
+        return
+    sentence = f"{name} has its principal point at ({cx:.1f}, {cy:.1f}), {place}."
+    warn(Finding("camera.principal-point", f"{sentence} If {name} is for another resolution, {SCALED_K}."))
+
+
+def _warn_of_aspect_ratio(K: np.ndarray, name: str) -> None:
+    """Warn if pixels are far from square."""
     if max(K[0, 0] / K[1, 1], K[1, 1] / K[0, 0]) > MAX_ASPECT_RATIO:
         numbers = f"{name} has fx {K[0, 0]:.5g} and fy {K[1, 1]:.5g}"
         message = f"{numbers}, but pixels are usually square. Check both focal lengths."

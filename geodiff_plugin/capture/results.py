@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -228,22 +228,10 @@ def write_results(
     Requires ``write_agreement``. ``original`` is the transforms.json that the capture was read from. Clouds
     and exports have only depths that are reliable under the ``thresholds``.
     """
-    unsure = (
-        set(doubted) if len(doubted) < len(names) else set()
-    )  # only points of these frames that another frame confirms are used
-
-    def load(name: str) -> DepthFrame:
-        frame = _frame(capture, out, AGREED, name)
-        frame = replace(frame, confidence=frame.confidence * reliable(frame, thresholds))
-        return replace(frame, observers=np.ones_like(frame.observers)) if name in unsure else frame
-
+    to_confirm = frozenset(doubted) if len(doubted) < len(names) else frozenset()
+    load = partial(_exported_frame, capture, out, thresholds, to_confirm)
     cloud, normals = fuse(names, load, capture.image)
-    parts = (cloud.points_m, normals, cloud.colours)
-    count = len(cloud.points_m)
-    write_vertices(out / "cloud.ply", "world frame", capture.unit, count, VERTEX, [parts])
-    cameras = map(capture.camera, names)
-    drawn = [(camera.K, camera.E, camera.size) for camera in cameras]
-    write_glb(out / "cloud.glb", cloud.thinned(GLB_POINTS), drawn)
+    _write_cloud(capture, out, names, cloud, normals)
     if "mesh" in export:
         write_mesh(out / "mesh.ply", names, load, capture.image)
     if "colmap" in export:
@@ -251,13 +239,47 @@ def write_results(
         seen = [solved.seen[capture.names.index(name)] for name in names]
         write_workspace(out / "colmap", map(load, names), capture.image, solved.points, seen)
     if "nerfstudio" in export:
-        write_splats(out / "nerfstudio", capture, names, lambda name: _confident(load(name)), cloud, original)
+        write_splats(
+            out / "nerfstudio", capture, names, lambda name: _splat_frame(load(name)), cloud, original
+        )
     _sheet(capture, out, names, doubted)
     _video(capture, out, names)
-    return {"cloud_points": count}
+    return {"cloud_points": len(cloud.points_m)}
 
 
-def _confident(frame: DepthFrame) -> SplatFrame:
+def _exported_frame(
+    capture: Capture, out: Path, thresholds: Thresholds, to_confirm: Collection[str], name: str
+) -> DepthFrame:
+    """Read an agreed frame, with confidence 0 where its depth is not reliable.
+
+    Frames ``to_confirm`` count as observed everywhere, so that ``kept`` selects only the points that another
+    frame confirms.
+    """
+    frame = _frame(capture, out, AGREED, name)
+    frame = replace(frame, confidence=frame.confidence * reliable(frame, thresholds))
+    if name in to_confirm:
+        frame = replace(frame, observers=np.ones_like(frame.observers))
+    return frame
+
+
+def _write_cloud(
+    capture: Capture, out: Path, names: Sequence[str], cloud: Cloud, normals: np.ndarray
+) -> None:
+    """Write a fused cloud as PLY with its normals, and as GLB with the cameras of the frames."""
+    columns = (cloud.points_m, normals, cloud.colours)
+    write_vertices(
+        out / "cloud.ply",
+        frame="world frame",
+        unit=capture.unit,
+        count=len(cloud.points_m),
+        names=VERTEX,
+        parts=[columns],
+    )
+    cameras = [(camera.K, camera.E, camera.size) for camera in map(capture.camera, names)]
+    write_glb(out / "cloud.glb", cloud.thinned(GLB_POINTS), cameras)
+
+
+def _splat_frame(frame: DepthFrame) -> SplatFrame:
     return SplatFrame(frame, kept(frame))
 
 

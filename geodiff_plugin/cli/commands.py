@@ -141,18 +141,30 @@ def _parameter(option: Setting) -> click.Parameter:
     required = option.default is MISSING
     default = _default_text(option)
     sentence = f"{option.help} [default: {default}]" if default else option.help
-    more: dict[str, Any] = {"help": sentence.replace("-", NO_BREAK), "required": required}
-    more |= {} if required else {"default": option.default}
-    if option.is_argument:
-        shown = (option.metavar or option.flag) + "..." * option.several
-        more |= {"metavar": shown if required else f"[{shown}]", "nargs": -1 if option.several else 1}
-        return click.Argument([option.name], type=_Typed(option), **more)
+    common: dict[str, Any] = {"help": sentence.replace("-", NO_BREAK), "required": required}
+    if not required:
+        common["default"] = option.default
+    return _argument(option, common) if option.is_argument else _option(option, common)
+
+
+def _argument(option: Setting, common: dict[str, Any]) -> click.Argument:
+    """Create the click argument for a setting; ``common`` are arguments that every parameter has."""
+    metavar = option.metavar or option.flag
+    if option.several:
+        metavar += "..."
+    if not common["required"]:
+        metavar = f"[{metavar}]"
+    count = -1 if option.several else 1
+    return click.Argument([option.name], type=_Typed(option), metavar=metavar, nargs=count, **common)
+
+
+def _option(option: Setting, common: dict[str, Any]) -> click.Option:
+    """Create the click option for a setting; ``common`` are arguments that every parameter has."""
+    names = [option.name, *(option.flags or (option.flag,))]
     if option.kind is bool:
-        more |= {"is_flag": True}
-    else:
-        repeated = option.several and not option.comma_separated
-        more |= {"type": _Typed(option), "metavar": option.metavar, "multiple": repeated}
-    return click.Option([option.name, *(option.flags or (option.flag,))], **more)
+        return click.Option(names, is_flag=True, **common)
+    is_repeated = option.several and not option.comma_separated
+    return click.Option(names, type=_Typed(option), metavar=option.metavar, multiple=is_repeated, **common)
 
 
 def _default_text(option: Setting) -> str:

@@ -193,11 +193,18 @@ def metric_values(records: Sequence[Record], alignment: str, metric: str) -> Val
     return by_method(records, lambda record: value_at(record, f"capped.{alignment}.{metric}"))
 
 
-def groups_of(records: Sequence[Record]) -> dict[str, set[str]]:
-    """Return labels of all samples, and of rectified and posed ones if both occur."""
-    kinds = (("rectified ", True), ("posed ", False))
-    labels = {name: {label_of(r) for r in records if r.get("rectified") is kind} for name, kind in kinds}
-    groups = {"": set().union(*labels.values())} | (labels if all(labels.values()) else {})
+def groups_of(records: Sequence[Record]) -> dict[str, list[str]]:
+    """Return labels of all samples in order of occurrence, and of rectified and posed ones if both occur.
+
+    The order matters: the resampled images of an interval depend on it.
+    """
+    by_kind: dict[str, list[str]] = {}
+    for kind, is_rectified in (("rectified ", True), ("posed ", False)):
+        labels = (label_of(record) for record in records if record.get("rectified") is is_rectified)
+        by_kind[kind] = list(dict.fromkeys(labels))
+    either = {label for labels in by_kind.values() for label in labels}
+    everything = [label for label in dict.fromkeys(map(label_of, records)) if label in either]
+    groups = {"": everything} | (by_kind if all(by_kind.values()) else {})
     return {count_of_pairs(len(members), kind): members for kind, members in groups.items()}
 
 
@@ -210,16 +217,22 @@ def per_pair_table(
     title: str, columns: Columns, value_of: ValueOf, digits: int, note: str = "", mean: MeanOf = whole_mean
 ) -> Table:
     """Return a row per sample, a column per group of records, then the means of each group of samples."""
-    header, records_of = zip(*columns, strict=True)
-    values = [{label_of(record): value_of(record) for record in column} for column in records_of]
-    every = list(chain(*records_of))
-    labels = dict.fromkeys(map(label_of, every))
-    rows = [(label, *(cell(column.get(label), digits) for column in values)) for label in labels]
-    for group, members in groups_of(every).items():
+    headings = []
+    all_records: list[Record] = []
+    values_of_columns = []
+    for heading, records in columns:
+        headings.append(heading)
+        all_records += records
+        values_of_columns.append({label_of(record): value_of(record) for record in records})
+    rows = [
+        (label, *(cell(values.get(label), digits) for values in values_of_columns))
+        for label in dict.fromkeys(map(label_of, all_records))
+    ]
+    for group, members in groups_of(all_records).items():
         if members:
-            means = (mean([column.get(label) for label in members], digits) for column in values)
+            means = (mean([values.get(label) for label in members], digits) for values in values_of_columns)
             rows.append((f"mean of {group}", *means))
-    return Table(title, ("pair", *header), tuple(rows), note)
+    return Table(title, ("pair", *headings), tuple(rows), note)
 
 
 def method_columns(records: Sequence[Record]) -> list[tuple[str, list[Record]]]:

@@ -105,8 +105,16 @@ class RowTasks:
         rgb_images = self._images
 
         def work() -> CheckedRows:
-            shifts = match_rows(rgb_images, self._greys(), rgb_images.shift_px(float(received())))
-            found = row_matches(rgb_images, shifts)
-            return CheckedRows(found, measure(RowsStage(*shifts, self._lines.result(), self._size)))
+            nearest_px = rgb_images.shift_px(float(received()))
+            shifts = match_rows(rgb_images, self._greys(), nearest_px)
+            stage = RowsStage(
+                grey=shifts.grey,
+                shift=shifts.shift,
+                matched=shifts.known,
+                gaps=shifts.gaps,
+                lines=self._lines.result(),
+                size=self._size,
+            )
+            return CheckedRows(row_matches(rgb_images, shifts), measure(stage))
 
         return BackgroundTask(work, rgb_images.device)

@@ -180,15 +180,13 @@ def read_capture(
 
 def _with_own_masks(frames: Sequence[CaptureFrame]) -> tuple[list[CaptureFrame], list[Finding]]:
     """Return the frames with the masks that the capture has, by its file or in COLMAP's folder."""
+    masked = [replace(frame, mask=_own_mask(frame)) for frame in frames]
+    pairs = zip(frames, masked, strict=True)
+    missing = [named.name for named, found in pairs if named.mask is not None and found.mask is None]
     findings = list[Finding]()
-    missing = [frame.name for frame in frames if frame.mask is not None and not os.path.isfile(frame.mask)]
     if missing:
         sentence = f"{some_names(missing)}: the mask does not exist, so all of their pixels count as valid."
         findings.append(Finding("capture.no-mask", sentence))
-    masked = [
-        replace(frame, mask=None if frame.name in missing else frame.mask or colmap_mask(frame.image))
-        for frame in frames
-    ]
     count = sum(frame.mask is not None for frame in masked)
     if count:
         sentence = (
@@ -197,6 +195,13 @@ def _with_own_masks(frames: Sequence[CaptureFrame]) -> tuple[list[CaptureFrame],
         )
         findings.append(Finding("capture.masks", sentence))
     return masked, findings
+
+
+def _own_mask(frame: CaptureFrame) -> Path | None:
+    """Return the mask that the capture's file names, if it exists; without a name, the one for COLMAP."""
+    if frame.mask is None:
+        return colmap_mask(frame.image)
+    return frame.mask if os.path.isfile(frame.mask) else None
 
 
 def _with_masks(frames: Sequence[CaptureFrame], given: Path) -> list[CaptureFrame]:
@@ -215,21 +220,32 @@ def _with_masks(frames: Sequence[CaptureFrame], given: Path) -> list[CaptureFram
 def _layout(source: Path, trajectory: Path | None, images: Path | None) -> Layout:
     """Return the result of the first reader that recognises a path."""
     if trajectory is not None:
-        layout = read_video(source, trajectory)
-        if layout is None:
-            bad_value("trajectory (--trajectory)", "omitted unless the capture is a video", trajectory)
-        return layout
+        return _layout_of_video(source, trajectory)
     raise_unread_capture(source)
-    for each in LAYOUTS:
-        layout = each.read(source, images) if each.names_images else each.read(source)
-        if layout is None:
-            continue
-        if images is not None and not each.names_images:
-            expected = "omitted unless a file lists the images"
-            bad_value("images (--images)", expected, f"{images} for {each.summary}")
-        poses = () if each.has_poses or source.is_file() else poses_in_folder(source, LAYOUTS)
-        return replace(layout, findings=(*layout.findings, *poses), has_poses=each.has_poses)
+    for kind in LAYOUTS:
+        layout = kind.read(source, images) if kind.names_images else kind.read(source)
+        if layout is not None:
+            return _checked_layout(layout, kind, source, images)
     raise_unknown(source, LAYOUTS)
+
+
+def _layout_of_video(source: Path, trajectory: Path) -> Layout:
+    """Return the frames of a video with the poses of a trajectory."""
+    layout = read_video(source, trajectory)
+    if layout is None:
+        bad_value("trajectory (--trajectory)", "omitted unless the capture is a video", trajectory)
+    return layout
+
+
+def _checked_layout(layout: Layout, kind: CaptureFormat, source: Path, images: Path | None) -> Layout:
+    """Check that a layout has a use for the folder ``images``; add a finding on poses that are not read."""
+    if images is not None and not kind.names_images:
+        expected = "omitted unless a file lists the images"
+        bad_value("images (--images)", expected, f"{images} for {kind.summary}")
+    if kind.has_poses or source.is_file():
+        return replace(layout, has_poses=kind.has_poses)
+    unused = poses_in_folder(source, LAYOUTS)
+    return replace(layout, findings=(*layout.findings, *unused), has_poses=False)
 
 
 def _left_out(candidate: Candidate, problem: str) -> Candidate:
@@ -252,18 +268,22 @@ def _with_camera(
     frame: CaptureFrame, camera: RawCamera | None, as_stored: bool, typed: TypedCamera
 ) -> CaptureFrame:
     """Return the frame with size, K, lens and depth file; ``camera`` is the one in the capture's files."""
-    name = frame.image.name
     if frame.index is None:
         as_stored = as_stored and not _of_shown_pixels(frame.image, camera)
-        size = (stored_size if as_stored else upright_size)(frame.image, f"{frame.image}")
+        size_of_image = stored_size if as_stored else upright_size
+        size = size_of_image(frame.image, f"{frame.image}")
     else:
         assert camera is not None  # the camera has the video's size
         size = camera.size
     K = _intrinsics(frame, camera, size, as_stored, typed)
-    lens = None if camera is None else lens_of(camera, name)
-    depth = frame.depth if frame.depth is not None and os.path.isfile(frame.depth) else None
-    taken = Camera(np.asarray(K, float), size, lens)
-    return replace(frame, camera=taken, depth=depth, as_stored=as_stored)
+    lens = None if camera is None else lens_of(camera, frame.image.name)
+    has_depth = frame.depth is not None and os.path.isfile(frame.depth)
+    return replace(
+        frame,
+        camera=Camera(np.asarray(K, float), size, lens),
+        depth=frame.depth if has_depth else None,
+        as_stored=as_stored,
+    )
 
 
 def _intrinsics(

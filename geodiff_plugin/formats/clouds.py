@@ -203,12 +203,13 @@ def write_vertices(
     comment = f"comment {frame}, {'metres' if unit else 'no unit'}"
     lines = ["ply", "format binary_little_endian 1.0", comment, f"element vertex {count}"]
     lines += [f"property {'uchar' if name in COLOURS else 'float'} {name}" for name in names]
-    vertex = np.dtype([(name, "u1" if name in COLOURS else "<f4") for name in names])
+    vertex_type = np.dtype([(name, "u1" if name in COLOURS else "<f4") for name in names])
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
         for part in parts:
-            vertices = np.empty(len(part[0]), vertex)
-            for name, column in zip(names, (column for array in part for column in array.T), strict=True):
+            columns = [column for array in part for column in array.T]
+            vertices = np.empty(len(part[0]), vertex_type)
+            for name, column in zip(names, columns, strict=True):
                 vertices[name] = column
             file.write(vertices.tobytes())
 

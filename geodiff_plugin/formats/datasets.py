@@ -7,12 +7,14 @@ YoYo000/MVSNet; ``python_toolbox/convert_to_logfile.py`` of isl-org/TanksAndTemp
 
 from __future__ import annotations
 
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin._internal.checks import InputError, bad_value
 from geodiff_plugin.findings import Finding
 from geodiff_plugin.formats.files import read_rows, read_text
 from geodiff_plugin.formats.image_files import images_in
@@ -36,6 +38,9 @@ NED_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0
 NS_PER_S = 1e9
 #: Folders of a KITTI sequence, the colour camera first, with the number of the projection.
 KITTI_IMAGES = (("image_2", 2), ("image_0", 0), ("image_3", 3), ("image_1", 1))
+#: Rows per frame of a Tanks and Temples log: one of ``LOG_NUMBERS`` numbers, and a 4x4 matrix.
+LOG_ROWS = 5
+LOG_NUMBERS = 3
 #: Folders with the body's pose in EuRoC's layout.
 GROUND_TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "gt0", "leica0")
 
@@ -138,14 +143,25 @@ MVSNET_FOLDER = CameraPerImage(
 
 def read_log(path: Path) -> Layout | None:
     """Read a Tanks and Temples ``.log``: three numbers and a camera-to-world matrix per frame."""
-    files = [path] if path.suffix == ".log" else sorted(path.glob("*.log")) if path.is_dir() else []
-    for file in files:
-        rows = read_rows(file, f"{file}", "poses")
-        heads = rows[::5]
-        bodies = [[word for row in rows[n + 1 : n + 5] for word in row] for n in range(0, len(rows), 5)]
-        if all(len(head) == 3 for head in heads) and all(len(body) == 16 for body in bodies):
-            return _log(file, heads, bodies)
+    if path.suffix == ".log":
+        return _log_of_rows(path, read_rows(path, f"{path}", "poses"))
+    for file in sorted(path.glob("*.log")):
+        rows: list[list[str]] = []
+        with suppress(InputError):  # the log of any program, which may be empty or have decimal commas
+            rows = read_rows(file, f"{file}", "poses")
+        layout = _log_of_rows(file, rows)
+        if layout is not None:
+            return layout
     return None
+
+
+def _log_of_rows(file: Path, rows: list[list[str]]) -> Layout | None:
+    """Return the frames of a file with these rows; ``None`` unless it is a log with poses."""
+    frames = [rows[first : first + LOG_ROWS] for first in range(0, len(rows), LOG_ROWS)]
+    heads = [frame[0] for frame in frames]
+    bodies = [list(chain(*frame[1:])) for frame in frames]
+    is_log = all(len(head) == LOG_NUMBERS for head in heads) and all(len(body) == 16 for body in bodies)
+    return _log(file, heads, bodies) if frames and is_log else None
 
 
 def _log(file: Path, heads: list[list[str]], bodies: list[list[str]]) -> Layout:
@@ -159,10 +175,8 @@ def _log(file: Path, heads: list[list[str]], bodies: list[list[str]]) -> Layout:
 
     candidates = []
     for head, body in zip(heads, bodies, strict=True):
-        number, registered = (
-            int(float(head[0])),
-            int(float(head[1])) >= 0,
-        )  # the toolbox writes -1 for unregistered images
+        number = int(float(head[0]))
+        registered = int(float(head[1])) >= 0  # the toolbox writes -1 for unregistered images
         if not 0 <= number < len(images):
             bad_value(file.name, f"a log of the {len(images)} images next to it", f"a frame {number}")
         frame = CaptureFrame(images[number].stem, images[number])

@@ -173,16 +173,17 @@ def _numbers(entries: Entries, keys: str, name: str) -> np.ndarray:
 
 
 def _pose(entries: Entries, keys: str, name: str) -> np.ndarray:
-    first, *_ = (_numbers(entries, key, name) for key in keys.split())
-    numbers = _numbers(entries, keys, name)
-    what = f"{keys} of {name}"
-    if first.size == 9:
-        return transform(first, numbers[9:], what)
-    if numbers.size == 6:
+    """Return the ``(4, 4)`` matrix of a pose in any of the forms listed in ``PosedCameras``."""
+    rotation, *further = [_numbers(entries, key, name) for key in keys.split()]
+    numbers = np.concatenate([rotation, *further])
+    source = f"{keys} of {name}"
+    if rotation.size == 9:  # a rotation matrix under its own key; other matrices have their translation
+        return transform(rotation, numbers[9:], source)
+    if numbers.size == 6:  # a rotation vector and a translation
         return pose_of(Rotation.from_rotvec(numbers[:3]), numbers[3:])
-    if numbers.size == 7:
+    if numbers.size == 7:  # a quaternion and a translation
         return pose_of(Rotation.from_quat(numbers[:4]), numbers[4:])
-    return rigid(numbers, what)
+    return rigid(numbers, source)
 
 
 # Functions that return the cameras of each format. Entries keep the file's keys; added keys are documented.
@@ -240,11 +241,14 @@ def vins_cameras(texts: tuple[str, ...]) -> Cameras:
     """Read a configuration and the files in it; adds ``body_T_cam``, and flattens groups of parameters."""
     config, *files = (read_yaml(text) for text in texts)
     cameras = {}
-    for n, each in enumerate(files):
-        values = {**(each.get("distortion_parameters") or {}), **each["projection_parameters"]}
-        values = {VINS_KEYS.get(key, key): value for key, value in values.items()}
-        kind = {"model_type": str(each["model_type"]).upper(), "body_T_cam": config[f"body_T_cam{n}"]}
-        cameras[n] = each | values | kind
+    for number, entries in enumerate(files):
+        lens = entries.get("distortion_parameters") or {}
+        parameters = {**lens, **entries["projection_parameters"]}
+        camera = dict(entries)
+        camera |= {VINS_KEYS.get(key, key): value for key, value in parameters.items()}
+        camera["model_type"] = str(entries["model_type"]).upper()
+        camera["body_T_cam"] = config[f"body_T_cam{number}"]
+        cameras[number] = camera
     return cameras
 
 

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Collection
 from pathlib import PurePath
+from typing import NoReturn
 
 import numpy as np
 
@@ -34,7 +35,9 @@ NAMED_NUMBER = re.compile(r"^[ \t]*(\w+)[ \t]*[:=][ \t]*([-+.\deE]+)[ \t]*(?:#.*
 #: Minimum plausible baseline: users who copy the format often write metres.
 MIN_MIDDLEBURY_MM = 1.0
 PROJECTION = re.compile(r"(P_rect_|P)(\d+)")
-PAIRS = ((0, 1), (2, 3))
+#: Cameras of KITTI.
+GREY_PAIR = (0, 1)
+COLOUR_PAIR = (2, 3)
 #: Folder names of benchmarks: image_2 and image_02, and colored_0 in KITTI 2012.
 FOLDER = re.compile(r"(image|colored)_0?([0-3])(?!\d)")
 #: Keys of the baseline in metres.
@@ -137,25 +140,41 @@ def read_spring(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     images, recognised by name, have a baseline of 65 mm.
     """
     rows = array_of(texts[0].split(), (-1,), "fx fy cx cy").reshape(-1, 4)
-    turn = rows[:3, :3]
-    if len(rows) in (3, 4) and np.allclose(turn @ turn.T, np.eye(3), atol=ROTATION_TOLERANCE):
+    _reject_pose(rows)
+    left_image, number = _left_image(choice)
+    if SPRING_NAME not in left_image and choice.baseline_m is None:
+        _raise_not_spring(rows[0], left_image)
+    camera = RawCamera(intrinsics(*_spring_row(rows, number, choice)))
+    return make_rig(camera, camera, SPRING_BASELINE_M, rectified=True)
+
+
+def _reject_pose(rows: np.ndarray) -> None:
+    """Raise an error for rows ``(N, 4)`` that are a pose, 3x4 or 4x4."""
+    R = rows[:3, :3]
+    if len(rows) in (3, 4) and np.allclose(R @ R.T, np.eye(3), atol=ROTATION_TOLERANCE):
         hint = (
             "If it is the right camera's pose in the left camera's frame, pass it with --E, and K with --K."
         )
         bad_value("the file", "a calibration", "a pose", hint)
-    left_image, number = _left_image(choice)
-    if SPRING_NAME not in left_image and choice.baseline_m is None:
-        named = zip(("fx", "fy", "cx", "cy"), rows[0], strict=True)
-        typed = " ".join(f"--{name} {value:g}" for name, value in named)
-        hint = f"For parallel cameras, pass {typed} --baseline METRES."
-        got = f"fx fy cx cy of one camera and {left_image or 'no image'}"
-        bad_value("the file", "a file of Spring, with images named frame_left_0001.png etc.", got, hint)
-    row = number - 1 if number >= 0 else 0
-    if (rows != rows[0]).any() and not 0 <= row < len(rows):
+
+
+def _raise_not_spring(row: np.ndarray, left_image: str) -> NoReturn:
+    """Raise an error for a file of another program, whose baseline is unknown."""
+    values = zip(("fx", "fy", "cx", "cy"), row, strict=True)
+    typed = " ".join(f"--{name} {value:g}" for name, value in values)
+    hint = f"For parallel cameras, pass {typed} --baseline METRES."
+    got = f"fx fy cx cy of one camera and {left_image or 'no image'}"
+    bad_value("the file", "a file of Spring, with images named frame_left_0001.png etc.", got, hint)
+
+
+def _spring_row(rows: np.ndarray, number: int, choice: CameraChoice) -> np.ndarray:
+    """Return the row of a frame by its number from 1; the first if it has none (-1) or all rows are equal."""
+    if 1 <= number <= len(rows):
+        return rows[number - 1]
+    if number >= 0 and (rows != rows[0]).any():
         hint = "Spring's images are named frame_left_0001.png etc."
         bad_value("the left image", f"named with a number from 1 to {len(rows)}", choice.image_names, hint)
-    camera = RawCamera(intrinsics(*rows[row if 0 <= row < len(rows) else 0]))
-    return make_rig(camera, camera, SPRING_BASELINE_M, rectified=True)
+    return rows[0]
 
 
 def read_argoverse(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -200,14 +219,23 @@ def read_sceneflow(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(camera, camera, np.linalg.inv(E_left) @ E_right)
 
 
+def _kitti_pair_of_folder(path: str) -> tuple[int, int] | None:
+    """Return the pair that the innermost of KITTI's folder names in a path belongs to; ``None`` without."""
+    names = FOLDER.findall(path)
+    if not names:
+        return None
+    kind, camera = names[-1]
+    return COLOUR_PAIR if kind == "colored" or int(camera) in COLOUR_PAIR else GREY_PAIR
+
+
 def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[int, int]:
     """Return the given pair, or the one in the image folder's name, or the colour pair, or the only one."""
     have = sorted(available)
-    pairs = [pair for pair in PAIRS if set(pair) <= set(have)] or [(have[0], have[-1])]
-    for kind, camera in FOLDER.findall(str(choice.image_folder_hint))[-1:]:
-        pair = PAIRS[kind == "colored" or int(camera) >= 2]
-        if pair in pairs:
-            return two_cameras(choice, have, pair)
+    pairs = [pair for pair in (GREY_PAIR, COLOUR_PAIR) if set(pair) <= set(have)]
+    pairs = pairs or [(have[0], have[-1])]
+    pair_of_folder = _kitti_pair_of_folder(str(choice.image_folder_hint))
+    if pair_of_folder in pairs:
+        return two_cameras(choice, have, pair_of_folder)
     if len(pairs) > 1 and choice.cameras is None:
         which = "The calibration has a grey pair 0,1 and a colour pair 2,3; 2,3 is used."
         warn(Finding("calibration.kitti-cameras", f"{which} Select one with cameras (--cameras)."))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import zlib
 from contextvars import Context
 from dataclasses import dataclass, fields
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -27,6 +29,8 @@ from geodiff_plugin.pose.multiview import SolvedCapture
 POSES_FILE = "poses.npz"
 #: Arrays of solved poses that may be missing.
 OPTIONAL = ("E_given", "overlays")
+#: Errors of numpy for a missing, truncated or other file.
+DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error)
 
 
 def open_capture(options: CaptureOptions) -> Capture:
@@ -116,20 +120,30 @@ def _save_solved(path: Path, solved: SolvedCapture, key: str) -> None:
 
 
 def load_solved(path: Path, key: str) -> SolvedCapture | None:
-    """Read the solved poses of a file; ``None`` if it has none with that key."""
+    """Read the solved poses of a file; ``None`` if it has none with that key, or is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        if str(arrays.pop("key")) != key:
-            return None
-        cuts = np.cumsum(arrays.pop("counts"))[:-1]
-        px, point = np.split(arrays.pop("px"), cuts), np.split(arrays.pop("point"), cuts)
-        values: dict[str, Any] = {n: a.item() if a.ndim == 0 else a for n, a in arrays.items()}
-        values |= {name: None for name in OPTIONAL if not values[name].size}
-        values["findings"] = tuple(Finding(str(code), str(text)) for code, text in values["findings"])
-        return SolvedCapture(seen=tuple(zip(px, point, strict=True)), **values)
-    except (OSError, ValueError, KeyError, TypeError):
+        # Opened here, because numpy leaves a damaged archive open.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            arrays = dict(archive)
+        stored_key = str(arrays.pop("key"))
+        return _solved_of_arrays(arrays) if stored_key == key else None
+    except DAMAGED:
         return None
+
+
+def _solved_of_arrays(arrays: dict[str, np.ndarray]) -> SolvedCapture:
+    """Return the solved poses of the arrays that ``_save_solved`` writes, without the key."""
+    further = dict(arrays)
+    ends = np.cumsum(further.pop("counts"))[:-1]
+    px_of_frames = np.split(further.pop("px"), ends)
+    points_of_frames = np.split(further.pop("point"), ends)
+    seen = tuple(zip(px_of_frames, points_of_frames, strict=True))
+    findings = tuple(Finding(str(code), str(text)) for code, text in further.pop("findings"))
+    values: dict[str, Any] = {}
+    for name, array in further.items():
+        is_missing = name in OPTIONAL and not array.size
+        values[name] = None if is_missing else array.item() if array.ndim == 0 else array
+    return SolvedCapture(seen=seen, findings=findings, **values)
 
 
 def reopened_capture(options: CaptureOptions, keys: RunKeys) -> Capture:

@@ -151,11 +151,11 @@ def pairs_to_folders(options: DepthOptions, items: Sequence[Item]) -> Iterator[D
 
 
 def _write_folder(row: Row) -> Row:
-    kept, reported = attempt(row, _folder_of)
+    kept, reported = attempt(row, _write_once)
     return kept | (reported or {})
 
 
-def _folder_of(run: PairRun) -> Row:
+def _write_once(run: PairRun) -> Row:
     """Write the folder of a pair unless an earlier attempt, lost afterwards, did; return its table row."""
     options = run.options
     assert options.out is not None

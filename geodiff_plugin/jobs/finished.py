@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from geodiff_plugin._internal.checks import bad_value
@@ -52,18 +53,11 @@ def finished_row(options: DepthOptions) -> Row | None:
     """
     assert options.out is not None
     report = read_report(options.out)
-    try:
-        made = report["arguments"]
-        row = row_of(report)
-        # The report is written last and lists all files, so a folder that has all of them is complete.
-        if not all((options.out / name).stat().st_size > 0 for name in report["files"]["names"]):
-            return None
-    except (OSError, KeyError, TypeError):
+    row = _row_if_complete(options.out, report)
+    if row is None:
         return None
-    changes = changed_options(options, made)
-    digests = report.get("pair", {}).get("sha256", {})
-    changed = [path for path, digest in file_digests(options).items() if digests.get(path, digest) != digest]
-    changes += map(input_change, changed)
+    changes = changed_options(options, report["arguments"])
+    changes += map(input_change, _changed_inputs(options, report))
     if changes:
         hint = (
             "Choose another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
@@ -71,6 +65,27 @@ def finished_row(options: DepthOptions) -> Row | None:
         got = f"{options.out}, {', '.join(changes)}"
         bad_value("--out", "a folder with results of the same options and files", got, hint)
     return row
+
+
+def _row_if_complete(folder: Path, report: dict[str, Any]) -> Row | None:
+    """Return the row of a report; ``None`` if the report is unreadable, or any of its files is missing.
+
+    The report is written last and lists all files, so a folder that has all of them is complete.
+    """
+    if "arguments" not in report:
+        return None
+    try:
+        row = row_of(report)
+        has_files = all((folder / name).stat().st_size > 0 for name in report["files"]["names"])
+    except (OSError, KeyError, TypeError):
+        return None
+    return row if has_files else None
+
+
+def _changed_inputs(options: DepthOptions, report: dict[str, Any]) -> list[str]:
+    """Return the input files whose content has changed since a report, if it states their digests."""
+    digests = report.get("pair", {}).get("sha256", {})
+    return [path for path, digest in file_digests(options).items() if digests.get(path, digest) != digest]
 
 
 def _confidence(verdict: dict[str, Any]) -> float | None:

@@ -22,8 +22,8 @@ BENCHMARKS = {
 }
 
 
-def _map(path: Path) -> np.ndarray:
-    """Return the map of a frame, memory-mapped, because the maps of a long video exceed the memory."""
+def _mapped_depth(path: Path) -> np.ndarray:
+    """Check and memory-map the depth map of a frame, because the maps of a long video exceed the memory."""
     file = formats.check_file(path, "FRAME", "a folder of geodiff depth or a .npy")
     expected = "a depth map (H, W) of floats in metres"
     depth_m = read_npy(file, "FRAME", expected)
@@ -56,7 +56,7 @@ def write_video(
     plotting.check_video(out, fps)
     check_new_file(out, overwrite)
     files = [path / "depth.npy" if os.path.isdir(path) else path for path in frames]
-    depths_m = [_map(file) for file in files]
+    depths_m = [_mapped_depth(file) for file in files]
     sizes = ["{1}x{0}".format(*depth_m.shape) for depth_m in depths_m]
     for path, size in zip(frames, sizes, strict=True):
         if size != sizes[0]:

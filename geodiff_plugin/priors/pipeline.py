@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,8 @@ Condition = dict[str, Tensor]
 Generators = torch.Generator | list[torch.Generator] | None
 #: Resampling modes of the stock pipeline.
 RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
+#: Mode for further maps, such as normals, whose unit length it keeps.
+EXTRA_RESAMPLING = "nearest-exact"
 
 
 def upcast(x: Tensor) -> Tensor:
@@ -66,6 +68,25 @@ class DepthOutput(MarigoldDepthOutput):
     """``MarigoldDepthOutput`` with further maps by name, such as ``"normals"``, of any number of channels."""
 
     extras: dict[str, np.ndarray | Tensor] = field(default_factory=dict)
+
+
+class _OutputGrid(NamedTuple):
+    """Converts maps on the padded grid of the network to outputs of a call."""
+
+    processor: MarigoldImageProcessor
+    padding: tuple[int, int]  # rows and columns
+    size: tuple[int, int] | None  # (H, W) of the outputs; None for the network's, without padding
+    as_numpy: bool
+
+    def cropped(self, maps: Tensor) -> Tensor:
+        """Remove the padding of maps ``(N, C, H, W)``."""
+        return self.processor.unpad_image(maps, self.padding)
+
+    def restored(self, maps: Tensor, resampling: str) -> Tensor | np.ndarray:
+        """Resize cropped maps ``(N, C, H, W)`` to the size of the outputs, and convert them."""
+        if self.size is not None:
+            maps = self.processor.resize_antialias(maps, self.size, resampling, is_aa=False)
+        return self.processor.pt_to_numpy(maps) if self.as_numpy else maps
 
 
 class DepthPrior:
@@ -312,37 +333,39 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         """
         steps, resolution = self._steps_and_resolution(num_inference_steps, processing_resolution)
         resampling = resample_method_output or self.output_resampling
-        check_number(ensemble_size, "ensemble_size", 2 if output_uncertainty else 1, 1 << 20, integer=True)
-        check_number(batch_size, "batch_size", 1, 1 << 20, integer=True)
+        self._check_sizes(ensemble_size, batch_size, output_uncertainty)
         self._check_choices(output_type, resample_method_input, resampling, options)
-        processor = self.image_processor
-        place = (self._execution_device, self.dtype)
-        padded, padding, size = processor.preprocess(image, resolution, resample_method_input, *place)
+        padded, padding, size = self.image_processor.preprocess(
+            image, resolution, resample_method_input, self._execution_device, self.dtype
+        )
         padded = padded.contiguous()  # (N, 3, H, W); in another layout a network rounds differently
         condition = self.prepare_condition(padded, ensemble_size, batch_size, generator, **options)
         z = self._start(condition, latents, generator)  # (N * E, C, h, w)
         z = self._run_steps(z, condition, steps, batch_size, generator)
-
-        def restore(maps: Tensor, method: str = resampling) -> Tensor | np.ndarray:
-            if match_input_resolution:
-                maps = processor.resize_antialias(maps, size, method, is_aa=False)
-            return processor.pt_to_numpy(maps) if output_type == "np" else maps
-
-        maps = torch.cat([self.decode_prediction(chunk) for chunk in z.split(batch_size)])
-        maps, spread = self.combine_members(
-            processor.unpad_image(maps, padding), ensemble_size, output_uncertainty, ensembling_kwargs or {}
+        grid = _OutputGrid(
+            processor=self.image_processor,
+            padding=padding,
+            size=size if match_input_resolution else None,
+            as_numpy=output_type == "np",
         )
+        members = torch.cat([self.decode_prediction(chunk) for chunk in z.split(batch_size)])
+        maps, spread = self.combine_members(
+            grid.cropped(members), ensemble_size, output_uncertainty, ensembling_kwargs or {}
+        )
+        extras = self.decode_extras(z, ensemble_size)
         output = DepthOutput(
-            prediction=restore(maps),
-            uncertainty=None if spread is None else restore(spread),
+            prediction=grid.restored(maps, resampling),
+            uncertainty=None if spread is None else grid.restored(spread, resampling),
             latent=z if output_latent else None,
-            extras={
-                name: restore(processor.unpad_image(extra, padding), "nearest-exact")  # keeps unit normals
-                for name, extra in self.decode_extras(z, ensemble_size).items()
-            },
+            extras={name: grid.restored(grid.cropped(x), EXTRA_RESAMPLING) for name, x in extras.items()},
         )
         self.maybe_free_model_hooks()
         return output if return_dict else (output.prediction, output.uncertainty, output.latent)
+
+    def _check_sizes(self, ensemble_size: int, batch_size: int, output_uncertainty: bool) -> None:
+        """Raise an ``InputError`` for a number of members or of maps at a time."""
+        check_number(ensemble_size, "ensemble_size", 2 if output_uncertainty else 1, 1 << 20, integer=True)
+        check_number(batch_size, "batch_size", 1, 1 << 20, integer=True)
 
     def _check_choices(self, output_type: str, resample_in: str, resample_out: str, options: Any) -> None:
         """Raise an ``InputError`` for an unknown choice or argument of a call."""

@@ -277,6 +277,10 @@ class GuidedScheduler:
         is_patched = any(name in vars(original) for name in ("set_timesteps", "step"))
         self._scheduler = original if is_patched else copy.copy(original)
         self._inside = dict(vars(self._scheduler)) | self._wrapped()
+        # Of the current trajectory, from ``set_timesteps`` on.
+        self._timesteps: Tensor  # on the CPU
+        self._numbers: list[int | float]  # the same
+        self._done: int  # number of steps
 
     @contextmanager
     def attached(self) -> Iterator[None]:
@@ -306,11 +310,14 @@ class GuidedScheduler:
         @functools.wraps(stock_set_timesteps)
         def set_timesteps(*args: Any, **kwargs: Any) -> None:
             device = kwargs.get("device")
-            stock_set_timesteps(*args, **kwargs | ({} if device is None else {"device": "cpu"}))
-            trailing = (
-                trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._trailing_spacing else None
-            )
-            self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()
+            if device is not None:
+                kwargs["device"] = "cpu"
+            stock_set_timesteps(*args, **kwargs)
+            timesteps = scheduler.timesteps
+            if self._trailing_spacing:
+                trailing = trailing_timesteps(scheduler, len(timesteps))
+                timesteps = timesteps if trailing is None else trailing
+            self._timesteps = timesteps.cpu()
             self._numbers = self._timesteps.tolist()
             self._done = 0
             self._run.begin(self._timesteps)

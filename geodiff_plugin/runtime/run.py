@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -182,15 +183,22 @@ class GuidedRun:
         self._results.append(None)
         self._step = 0
         self._timesteps = timesteps.tolist()
-        self._shown = self._first_output = None
+        self._shown = None
+        self._first_output = None
         if self.schedule is None:
-            rounds = self._rounds
-            encodes = self._denoiser is None
-            count = len(timesteps)
-            self.schedule = make_schedule(self.config, self._plan, count, rounds=rounds, encodes=encodes)
-            options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
-            chunks = -(-len(self._image_of_sample) // self.call["batch_size"])
-            self._bar = tqdm(total=chunks * len(timesteps), **options)
+            self.schedule = self._make_schedule(len(timesteps))
+            self._bar = self._make_bar(len(timesteps))
+
+    def _make_schedule(self, steps: int) -> Schedule:
+        """Return the schedule that every chunk follows."""
+        encodes = self._denoiser is None
+        return make_schedule(self.config, self._plan, steps, rounds=self._rounds, encodes=encodes)
+
+    def _make_bar(self, steps: int) -> tqdm:
+        """Return a progress bar over the steps of all chunks, with the options of the pipeline's own."""
+        chunks = math.ceil(len(self._image_of_sample) / self.call["batch_size"])
+        options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
+        return tqdm(total=chunks * steps, **options)
 
     def _trajectory(self) -> Trajectory:
         """Return the trajectory of the current chunk; the first call waits for the evidence."""

@@ -49,14 +49,22 @@ class _Best(NamedTuple):
 def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> Groups:
     """Sort values ``x (P,)``, with ``cost`` and ``in_view (D, P)``, into groups of equal size."""
     order = x.argsort()
-    each = group_size(len(x))
+    pixels_per_group = group_size(len(x))
+    count = math.ceil(len(x) / pixels_per_group)
+    padding = count * pixels_per_group - len(x)  # only the last group is smaller
 
-    def summed(values: Tensor) -> Tensor:
-        return F.pad(values[..., order], (0, -len(x) % each)).unflatten(-1, (-1, each)).sum(-1)
+    def sum_of_groups(values: Tensor) -> Tensor:
+        padded = F.pad(values[..., order], (0, padding))
+        return padded.unflatten(-1, (count, pixels_per_group)).sum(-1)
 
     seen = in_view.to(cost)
-    size = summed(torch.ones_like(x))
-    return Groups(summed(x) / size, size, summed(seen), summed(cost.clamp_max(COST_CLAMP) * seen))
+    size = sum_of_groups(torch.ones_like(x))
+    return Groups(
+        mean=sum_of_groups(x) / size,
+        size=size,
+        seen=sum_of_groups(seen),
+        cost=sum_of_groups(cost.clamp_max(COST_CLAMP) * seen),
+    )
 
 
 def look_up(groups: Groups, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Tensor, Tensor]:

@@ -113,9 +113,9 @@ def live(
         bad_type("rig", "a Rig", rig, "Read one with read_calibration(path).")
     setup = setup_of_rig(rig, config, mask, right_mask) if isinstance(rig, Rig) else rig
     enable_geometry_guidance(pipe)
-    prepared = LiveRig(setup, pipe._execution_device, check_every, among=THREADS, kernels=pipe._uses_kernels)
+    live_rig = LiveRig(setup, pipe._execution_device, check_every, among=THREADS, kernels=pipe._uses_kernels)
     run = partial(_run, pipe, seed=seed, call=call)
-    return _results(run, _opened(source, realtime=not every_frame), prepared, waits=every_frame)
+    return _results(run, _opened(source, realtime=not every_frame), live_rig, waits=every_frame)
 
 
 def _opened(source: Any, *, realtime: bool) -> Iterable[Any]:

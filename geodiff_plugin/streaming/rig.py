@@ -47,26 +47,24 @@ def setup_of_rig(rig: Rig, config: GuidanceConfig, mask: Any = None, right_mask:
     """Return the setup of a calibrated rig; the masks are for images without lens distortion."""
 
     def setup(left: np.ndarray, right: np.ndarray) -> RigSetup:
-        images = (left, right)
-        sizes = [(image.shape[1], image.shape[0]) for image in (left, right)]
+        left_size = (left.shape[1], left.shape[0])
+        right_size = (right.shape[1], right.shape[0])
         hint = "Use the size that the rig was calibrated for, or scale its K."
-        for size, name, calibrated in zip(
-            sizes, ("left", "right"), (rig.size_left, rig.size_right), strict=True
-        ):
-            check_calibrated_size(size, calibrated, f"the {name} frame", rig.source, hint)
-        sized = rig.sized(*sizes)
-        cameras = (sized.left, sized.right)
-        views = [pinhole(*view, config) for view in zip(images, cameras, strict=True)]
+        check_calibrated_size(left_size, rig.size_left, "the left frame", rig.source, hint)
+        check_calibrated_size(right_size, rig.size_right, "the right frame", rig.source, hint)
+        sized = rig.sized(left_size, right_size)
+        left_view = (pinhole(left, sized.left, config), rig.K_left, np.eye(4))
+        right_view = (pinhole(right, sized.right, config), rig.K_right, rig.E)
         guidance = GeometryGuidance.from_views(
-            list(zip(views, (rig.K_left, rig.K_right), (np.eye(4), rig.E), strict=True)),
-            mask=_seen(cameras[0]) if mask is None else mask,
-            right_mask=_seen(cameras[1]) if right_mask is None else right_mask,
+            [left_view, right_view],
+            mask=_seen(sized.left) if mask is None else mask,
+            right_mask=_seen(sized.right) if right_mask is None else right_mask,
             unit=rig.unit,
             measured_baseline=rig.measured,
             config=config,
         )
         guidance.calibrated = True
-        return RigSetup(cameras, guidance)
+        return RigSetup((sized.left, sized.right), guidance)
 
     return setup
 

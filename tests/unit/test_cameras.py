@@ -280,6 +280,18 @@ def test_pixels_without_a_ray_become_nan(model):
     np.testing.assert_allclose(found[[0, 2]], pixels[[0, 2]], atol=0.1)
 
 
+@pytest.mark.parametrize("model", LENSES)
+def test_a_lens_displaces_the_same_part_of_an_image_after_one_side_is_halved(model):
+    camera = Camera(matrix_of(model), SIZE, lens_of(model))
+    halved = (SIZE[0], SIZE[1] // 2)
+    pixels = np.array([[10.0, 12.0], [41.0, 30.0], [60.0, 50.0]])
+    resized = resized_px(pixels, SIZE, halved)
+    rays = camera.rays(pixels)
+    assert np.isfinite(rays).all()
+    np.testing.assert_allclose(camera.resized(halved).rays(resized), rays, atol=1e-6)
+    np.testing.assert_allclose(camera.resized(halved).project(rays)[0], resized, atol=1e-4)
+
+
 def test_pixels_just_beyond_the_rim_of_a_lens_become_nan():
     """``r (1 - 0.6 r^2)`` is largest at ``r = sqrt(1 / 1.8)``."""
     lens, r = Distortion("opencv", np.array([-0.6, 0, 0, 0])), np.sqrt(1 / 1.8)

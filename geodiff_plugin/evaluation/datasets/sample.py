@@ -236,26 +236,38 @@ def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: st
     Every second error resembles a tracker's: the translation compensates the rotation at the scene's depth.
     """
     sample.check_ground_truth()
-    rng, (degrees, fraction) = np.random.default_rng(zlib.crc32(name.encode())), change
+    limits = _PoseError(*change)
     depth_m = float(np.median(sample.depth_m[sample.valid]))
+    rng = np.random.default_rng(zlib.crc32(name.encode()))  # draws for the first view, then for the others
+    E = _perturbed_pose(sample.E, limits, depth_m, rng)
+    extra_views = tuple(
+        view._replace(E=_perturbed_pose(view.E, limits, depth_m, rng)) for view in sample.extra_views
+    )
+    return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra_views)
 
-    def wrong(E: Array) -> Array:
-        axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-        turn = axis * np.radians(degrees) * rng.uniform(MIN_FRACTION, 1.0)
-        baseline = float(np.linalg.norm(E[:3, 3]))
-        shift = way * fraction * baseline * rng.uniform(MIN_FRACTION, 1.0)
-        if rng.random() < 0.5:
-            shift = -np.cross(turn, (0.0, 0.0, depth_m))
-            shift *= min(1.0, fraction * baseline / max(float(np.linalg.norm(shift)), 1e-12))
-        given = E.copy()
-        moved = E[:3, 3] + E[:3, :3] @ shift
-        given[:3, :3] = E[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
-        given[:3, 3] = moved * baseline / np.linalg.norm(moved)
-        return given
 
-    E = wrong(sample.E)
-    extra = tuple(view._replace(E=wrong(view.E)) for view in sample.extra_views)
-    return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra)
+class _PoseError(NamedTuple):
+    """Maximum error of a pose."""
+
+    degrees: float
+    fraction: float  # of the baseline
+
+
+def _perturbed_pose(E: Array, limits: _PoseError, depth_m: float, rng: np.random.Generator) -> Array:
+    """Return a camera-to-world pose with a random error, and with the same length of its baseline."""
+    rotation_axis, direction = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+    rotation = rotation_axis * np.radians(limits.degrees) * rng.uniform(MIN_FRACTION, 1.0)
+    baseline = float(np.linalg.norm(E[:3, 3]))
+    limit_m = limits.fraction * baseline
+    shift = direction * limit_m * rng.uniform(MIN_FRACTION, 1.0)
+    if rng.random() < 0.5:  # like a tracker's: points at this depth stay in place
+        shift = -np.cross(rotation, (0.0, 0.0, depth_m))
+        shift *= min(1.0, limit_m / max(float(np.linalg.norm(shift)), 1e-12))
+    position = E[:3, 3] + E[:3, :3] @ shift
+    perturbed = E.copy()
+    perturbed[:3, :3] = E[:3, :3] @ Rotation.from_rotvec(rotation).as_matrix()
+    perturbed[:3, 3] = position * baseline / np.linalg.norm(position)
+    return perturbed
 
 
 def with_scaled_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:

@@ -753,7 +753,7 @@ def model(tmp_path, monkeypatch):
     monkeypatch.setattr(capture_frame, "depth_of_frame", with_unit)
     for module in (capture_frame, capture_frames):
         monkeypatch.setattr(module, "prior_of_capture", lambda options: None)
-    monkeypatch.setattr(capture_frame, "write_maps", lambda folder, output, image: {})
+    monkeypatch.setattr(capture_frame, "write_maps", lambda folder, output, image, *limits: {})
     return lambda **options: CaptureOptions(
         path=source, out=tmp_path / "out", frames="2:6:2", quiet=True, processes=1, overwrite=True, **options
     )

@@ -181,6 +181,17 @@ def test_summaries_are_means_under_the_cap_of_the_members_as_is_and_aligned():
     assert [row[1] for row in some] == ["1", "1", "1"]
 
 
+def test_groups_keep_the_order_of_the_records_on_which_intervals_depend():
+    records = make_records("guided", 1) + make_records("sgbm", 2)
+    labels = ["set0/s0", "set1/s1", "set0/s2", "set1/s3", "set0/s4", "set1/s5"]
+    expected = {"6 pairs": labels, "3 rectified pairs": labels[::2], "3 posed pairs": labels[1::2]}
+    assert tables.groups_of(records) == expected
+    backwards = {name: members[::-1] for name, members in expected.items()}
+    assert tables.groups_of(records[::-1]) == backwards
+    del records[0]["rectified"], records[6]["rectified"]
+    assert tables.groups_of(records)["5 pairs"] == labels[1:]
+
+
 def test_the_reference_is_compared_with_each_other_method_on_common_pairs():
     records = make_records("guided", 1, 4) + make_records("sgbm", 2, 3) + make_records("paper", 3, 4)
     ours, theirs = ([r["all_pixels"]["raw"]["abs_rel"] for r in records[a:b]] for a, b in ((0, 4), (4, 7)))

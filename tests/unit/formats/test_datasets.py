@@ -187,3 +187,18 @@ def test_other_log_files_are_ignored(tmp_path, change):
     (tmp_path / "a.log").write_text("\n".join(lines))
     assert datasets.read_log(tmp_path) is None
     assert datasets.read_log(tmp_path / "10.png") is None
+
+
+@pytest.mark.parametrize("text", ["", "# a comment\n", "took 1,5 s of 2,5 s\n"])
+def test_the_log_of_another_program_does_not_hide_a_log_with_poses(tmp_path, text):
+    files = write_images(tmp_path, NAMES)
+    (tmp_path / "a.log").write_text(text)
+    assert datasets.read_log(tmp_path) is None
+    (tmp_path / "b.log").write_text(log_text())
+    assert_is_read(datasets.read_log(tmp_path), "Tanks and Temples", None, files, Ks=None)
+
+
+def test_a_log_that_the_user_names_is_not_skipped(tmp_path):
+    (tmp_path / "scene.log").write_text("0 1,5 2\n")
+    with pytest.raises(InputError, match="must be numbers with a decimal point"):
+        datasets.read_log(tmp_path / "scene.log")

@@ -38,8 +38,24 @@ def test_solved_poses_come_back_as_they_were(tmp_path, changes):
             np.testing.assert_array_equal(was, found)
         else:
             assert found == was or (math.isnan(found) and math.isnan(was)), field.name
-    (tmp_path / "poses.npz").write_bytes(b"cut off")
-    assert load_solved(tmp_path / "poses.npz", "key") is None
+
+
+@pytest.mark.parametrize("damage", ["other content", "empty", "start", "half", "end missing", "changed"])
+def test_poses_of_a_damaged_file_are_not_read(tmp_path, damage):
+    file = tmp_path / "poses.npz"
+    module._save_solved(file, solved(), "key")
+    content = file.read_bytes()
+    half = len(content) // 2
+    damaged = {
+        "other content": b"cut off",
+        "empty": b"",
+        "start": content[:10],
+        "half": content[:half],
+        "end missing": content[:-5],
+        "changed": content[:120] + bytes(40) + content[160:],
+    }
+    file.write_bytes(damaged[damage])
+    assert load_solved(file, "key") is None
 
 
 def test_poses_are_solved_once_for_each_key_and_by_no_shard(capture, tmp_path, solving):

@@ -327,7 +327,7 @@ def test_pairs_become_folders_with_the_options_of_a_run_without_ray(ray, stages,
         written.append(pair.options)
         return {"verdict": "trusted", "near_m": 1.5}
 
-    monkeypatch.setattr(cluster, "_folder_of", folder_of)
+    monkeypatch.setattr(cluster, "_write_once", folder_of)
     items = [Item(ref.name, ref) for ref in refs(4)]
     with Journal(tmp_path / "job.jsonl") as journal:
         runner = Runner(items, journal, progress=False)
@@ -346,12 +346,12 @@ def test_a_folder_that_a_lost_attempt_has_written_stays(ray, tmp_path, monkeypat
     monkeypatch.setattr(cluster, "write_row", lambda folder, run: {"near_m": 2.0, "of": run})
     options = replace(OPTIONS, out=tmp_path / "out", left=tmp_path / "left.png")
     run = SimpleNamespace(options=options)
-    assert cluster._folder_of(run) == {"near_m": 1.0} and asked == [options]
+    assert cluster._write_once(run) == {"near_m": 1.0} and asked == [options]
     run.options = replace(options, overwrite=True)
-    assert cluster._folder_of(run) == {"near_m": 2.0, "of": run} and len(asked) == 1
+    assert cluster._write_once(run) == {"near_m": 2.0, "of": run} and len(asked) == 1
     monkeypatch.setattr(cluster, "finished_row", lambda options: None)
     run.options = options
-    assert cluster._folder_of(run)["near_m"] == 2.0
+    assert cluster._write_once(run)["near_m"] == 2.0
 
 
 @pytest.mark.parametrize(("pairs", "workers", "size"), [(6, 2, 4), (100, 2, 13), (520, 1, 64), (5, 9, 4)])
