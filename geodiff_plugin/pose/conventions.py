@@ -84,8 +84,9 @@ def median_px(distances: Sequence[np.ndarray]) -> float:
 def find_convention(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> Convention:
     """Detect the convention of poses from the matches; as given if no other fits clearly better.
 
-    A rotation of the images relative to their cameras is detected only if it fits clearly better than every
-    convention with upright images. A camera that moves straight ahead does not determine it.
+    A rotation of the images relative to their cameras is detected only if it fits clearly better than the
+    convention that would be used for upright images. A camera that moves straight ahead does not determine
+    it.
 
     Args:
         E: ``(N, 4, 4)`` poses as given.
@@ -98,8 +99,7 @@ def find_convention(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> C
     upright = min((fit for fit in fits if not fit[1].quarters), key=itemgetter(0))
     rotated = min((fit for fit in fits if fit[1].quarters), key=itemgetter(0))
     chosen = upright if upright[0] < CONVENTION_GAIN * as_given[0] else as_given
-    # The best upright convention counts here even if it is not clearly better than the given one.
-    chosen = rotated if rotated[0] < CONVENTION_GAIN * upright[0] else chosen
+    chosen = rotated if rotated[0] < CONVENTION_GAIN * chosen[0] else chosen
     found = chosen[1]
     off_px = median_px(residuals_px(found.E, K, some))
     return found._replace(off_px=off_px, off=off_px / float(np.median(K[:, 0, 0])))
