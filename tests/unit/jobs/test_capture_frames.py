@@ -39,6 +39,11 @@ def test_on_a_cpu_a_process_a_core_works_as_far_as_memory_goes(
     assert module._processes(options(tmp_path, processes=asked, device=device), left) == count
 
 
+def test_a_process_that_may_have_no_workers_works_alone(monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "can_have_workers", lambda: False)
+    assert module._processes(options(tmp_path, processes=6, device="cpu"), 9) == 1
+
+
 def test_another_process_opens_the_capture_with_the_scale_of_the_first(run, monkeypatch):
     (run.folder / "out").mkdir()
     given, keys = options(run.folder, metres_per_unit=9.0), RunKeys("poses", "frames", KnownScale(2.0))

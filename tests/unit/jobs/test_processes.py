@@ -10,6 +10,7 @@ import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from itertools import permutations
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -23,6 +24,7 @@ from geodiff_plugin.jobs.processes import (
     ProcessEnded,
     WorkerProcess,
     WorkerProcesses,
+    _program_has_guard,
     can_have_workers,
 )
 from tests.unit.jobs.work_elsewhere import (
@@ -193,3 +195,12 @@ def test_it_knows_what_a_program_with_a_guard_adds(guard, answer, tmp_path):
     for how in (["program.py"], ["-m", "program"]):
         ran = subprocess.run([sys.executable, *how], capture_output=True, text=True, cwd=tmp_path)
         assert ran.stdout.splitlines() == [answer], ran.stderr
+
+
+@pytest.mark.parametrize("content", [None, "if __name__ ==", "print(1)"], ids=["absent", "damaged", "none"])
+def test_a_program_without_readable_guard_has_none(content, tmp_path, monkeypatch):
+    program = tmp_path / "program.py"
+    if content is not None:
+        program.write_text(content)
+    monkeypatch.setitem(sys.modules, "__main__", SimpleNamespace(__file__=str(program)))
+    assert _program_has_guard() is False

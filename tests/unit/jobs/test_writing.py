@@ -106,7 +106,9 @@ def test_maps_and_counts_are_those_of_the_output(run, tmp_path, plain_figures):
     np.testing.assert_array_equal(shown_left, np.rint(left * 255).astype(np.uint8))
     assert np.isnan(error[~seen]).all()
     np.testing.assert_array_equal(error[seen], one_map(output.photometric_error)[seen])
-    np.testing.assert_array_equal(plain_figures["fraction_figure"][0], confidence)
+    drawn, label, top, named = plain_figures["fraction_figure"]
+    np.testing.assert_array_equal(drawn, confidence)
+    assert (label, top, named) == ("confidence", 1.0, {})
     drawn, named = plain_figures["depth_figure"]
     np.testing.assert_array_equal(drawn, depth_m)
     assert named == {"unit": "m"}
