@@ -23,7 +23,7 @@ def sample():
 
 def test_a_map_has_the_stated_error(sample):
     def log_error(error: MapError) -> np.ndarray:
-        return np.log(map_with_error(sample, error) / sample.depth_m)[sample.valid]
+        return np.log(map_with_error(sample, error)[sample.valid] / sample.depth_m[sample.valid])
 
     assert np.abs(log_error(MapError())).max() < 1e-6
     far = log_error(MAP_ERRORS["far"])
