@@ -120,10 +120,12 @@ def _number(text: str | None, name: str) -> float | None:
     unit = (match[2] or "") if match else ""
     if not math.isfinite(value) or (unit and name not in LENGTHS):
         example = "such as 0.12 or 12 cm" if name in LENGTHS else "such as 812.5"
-        raise PageError(
-            f"{NUMBERS[name]}: enter a number {example}, not {text.strip()[:40]!r}. Clear the field if you "
-            "do not know it."
-        )
+        otherwise = "Clear the field if you do not know it."
+        if name == "baseline":
+            otherwise = (
+                'If you know it only roughly, choose "Estimate from the images" and "Only a rough distance".'
+            )
+        raise PageError(f"{NUMBERS[name]}: enter a number {example}, not {text.strip()[:40]!r}. {otherwise}")
     return value * _METRES[unit]
 
 
@@ -165,7 +167,10 @@ def _file_note(path: str | None, camera_input: str, camera: str, name: str) -> s
     hidden = "; browsers cannot display HEIC" if is_heic else ""
     notes = [f'<div class="note">{width} x {height} pixels{hidden}</div>']
     if camera_input == "images" and camera == "exif" and not states_focal_length(path):
-        missing = Message("The file does not state its focal length.", "Choose your camera below.")
+        missing = Message(
+            "The file does not state its focal length.",
+            "Choose your camera or field of view under Focal length.",
+        )
         notes.append(templates.needs_camera(missing))
     return "".join(notes)
 

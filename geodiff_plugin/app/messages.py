@@ -71,12 +71,12 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     ),
     "camera.assumed-intrinsics": (
         "The optical centre is assumed to be at the centre of the image.",
-        "Enter fy, cx and cy if you know them.",
+        'Enter fy, cx and cy with "Focal length and baseline" if you know them.',
     ),
     "camera.zoom": ("An image was zoomed digitally.", "Take it again without zoom, or enter fx."),
     "camera.assumed-cx": (
         "The right camera's cx is assumed to be the left camera's.",
-        "Enter the right camera's cx if you know it.",
+        'Enter its cx with "Focal length and baseline" if you know it.',
     ),
     "camera.principal-point": (
         "The optical centre in the calibration is far from the centre of the image, as if the image were "

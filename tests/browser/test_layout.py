@@ -64,7 +64,7 @@ def upload_images(page, paths) -> None:
     page.get_by_label("Estimate from the images").check()
     for name, path in zip(("left", "right"), paths, strict=True):
         page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
-        page.wait_for_selector(f"#{name}-note >> text=Choose your camera below")
+        page.wait_for_selector(f"#{name}-note >> text=Choose your camera")
 
 
 @pytest.mark.parametrize("width", [390, 768, 1440])

@@ -218,7 +218,7 @@ def test_a_phone_begins_with_the_images_alone_and_asks_for_what_they_lack(visito
     assert page.get_by_label("Estimate from the images").is_checked()
     for name, path in zip(("left", "right"), pair_without_exif, strict=True):
         page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
-        page.wait_for_selector(f"#{name}-note >> text=Choose your camera below")
+        page.wait_for_selector(f"#{name}-note >> text=Choose your camera")
     choose(page, "camera", "Enter the field of view")
     field(page, "fov").fill("60")
     page.wait_for_selector("#left-note >> text=608 x 460 pixels")
@@ -244,7 +244,7 @@ def test_a_camera_of_the_list_and_a_known_length_are_named_and_drawn(visitor, pa
     page = visitor()
     upload(page, pair_without_exif)
     page.get_by_label("Estimate from the images").click()
-    page.wait_for_selector("#left-note >> text=Choose your camera below")
+    page.wait_for_selector("#left-note >> text=Choose your camera")
     choose(page, "camera", "Camera with 28 mm")
     page.get_by_label("Known length in the left image").click()
     image = page.locator("#known-image img")

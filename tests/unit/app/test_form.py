@@ -99,6 +99,7 @@ def test_every_field_becomes_its_own_option(drawn, pair):
     for name, message in (
         ("far", "Farthest depth, m: enter a number such as 0.12 or 12 cm, not 'x'. Clear the field"),
         ("known_length", "Known length, m: enter a number such as 0.12 or 12 cm, not 'x'."),
+        ("baseline", "not 'x'. If you know it only roughly, choose \"Estimate from the images\""),
         ("cx_right", "Right camera's cx, px: enter a number such as 812.5, not 'x'."),
     ):
         with pytest.raises(PageError, match=message):
@@ -255,7 +256,9 @@ def test_a_dropped_file_is_described_by_its_size_or_its_error(drawn, pair, tmp_p
         )
         assert str(Path(__file__).parent) not in message
         missing = handler.fn(pair["left"], "images", "exif")
-        assert missing.startswith(size) and "Choose your camera below" in missing
+        assert (
+            missing.startswith(size) and "Choose your camera or field of view under Focal length" in missing
+        )
         assert handler.fn(pair["left"], "images", "fov") == size
     monkeypatch.setattr("geodiff_plugin.app.form.image_size", lambda path, name: (64, 40))
     for name, more in (
