@@ -182,7 +182,7 @@ def test_what_is_missing_or_does_not_fit_v2_is_named(convert_v2, assets):
     good, key = load_file(file), "Diffuser.img_in.lora_A.default.weight"
     for state, parts in (
         (good | {"Diffuser.nowhere.weight": torch.zeros(2)}, ("unexpected: nowhere.weight",)),
-        ({k: v for k, v in good.items() if k != key}, ("img_in.weight of factor A",)),
+        ({k: v for k, v in good.items() if k != key}, ("LoRA factor A of img_in.weight",)),
         ({k: v for k, v in good.items() if k.startswith("VAE.")}, ("with a LoRA",)),
     ):
         save_file(state, file)
