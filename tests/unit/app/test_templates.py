@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 
 import pytest
@@ -95,7 +96,7 @@ def test_the_banner_has_reasons_with_hints_before_numbers_and_notes_without():
     items = re.findall(r'<li data-code="([^"]*)">(.*?)</li>', reasons)
     assert [code for code, _ in items] == ["camera.assumed-cx", "camera.from-exif"]
     for code, text in items:
-        sentence, hint = (part.replace("'", "&#x27;") for part in FINDINGS_ON_PAGE[code])
+        sentence, hint = (escape(part) for part in FINDINGS_ON_PAGE[code])
         assert text.startswith(f'{sentence} <span class="hint">{hint}</span><details')
     assert f"LEFT {ESCAPED} y.png." in items[0][1], "the command's text is a detail, without folders"
     figures = re.findall(r"<div><b>(.*?)</b><span>(.*?)</span></div>", rest)
