@@ -237,7 +237,7 @@ def test_a_phone_begins_with_the_images_alone_and_asks_for_what_they_lack(visito
         float, re.search(rf"{NUMBER} ± {NUMBER} m", page.locator("#readings .distance").inner_text()).groups()
     )
     assert spread > 0.25 * length, "the uncertainty of the guess"
-    assert "of the scale" in page.locator("#readings").inner_text()
+    assert "for the scale" in page.locator("#readings").inner_text()
 
 
 def test_a_camera_of_the_list_and_a_known_length_are_named_and_drawn(visitor, pair_without_exif):
