@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         twin.get = lambda _: enable_geometry_guidance(emulated.pipe)  # type: ignore[method-assign]
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
     print(
-        "pair, prior, knobs, AbsRel, CPU seconds of the call (the first of a pair makes its evidence)",
+        "pair, prior, parameters, AbsRel, CPU seconds of the call (the first of a pair makes its evidence)",
         flush=True,
     )
     for ref in find_pairs(Path(typed.data)):
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 one = _error_and_seconds(sample, parameters, own, cache if prior == BUNDLED else twin)
                 found.setdefault((prior, parameters), []).append(one)
                 print(f"{ref.label:<28}{prior:<10}{parameters:<36}{one[0]:.4f}{one[1]:>8.2f}", flush=True)
-    print(f"\n{'prior':<10}{'knobs':<36}{'AbsRel':>8}{'change':>9}{'worst':>9}{'CPU s':>8}")
+    print(f"\n{'prior':<10}{'parameters':<36}{'AbsRel':>8}{'change':>9}{'worst':>9}{'CPU s':>8}")
     for prior in typed.priors:
         base = [error for error, _ in found[prior, typed.parameters[0]]]
         for parameters in typed.parameters:

@@ -285,17 +285,17 @@ def test_presets_differ_from_the_default_as_documented():
 RANGE_IN_WORDS = {name: parameter.values for name, parameter in PARAMETERS.items()}
 
 
-def knobs_of(pattern: str) -> list[str]:
+def parameters_of(pattern: str) -> list[str]:
     """Parameters whose range looks like this on the page."""
     return [name for name, values in RANGE_IN_WORDS.items() if re.match(pattern, values)]
 
 
 def test_every_parameter_is_a_number_a_choice_a_flag_a_pair_a_text_or_the_weights():
     kinds = (
-        knobs_of(r"(integer, )?\["),
-        knobs_of("`"),
-        knobs_of("bool"),
-        knobs_of("pair"),
+        parameters_of(r"(integer, )?\["),
+        parameters_of("`"),
+        parameters_of("bool"),
+        parameters_of("pair"),
         ["weights", "optimizer"],
     )
     assert sorted(itertools.chain(*kinds)) == sorted(PARAMETERS)
@@ -310,7 +310,7 @@ def test_a_parameter_is_none_only_if_its_range_allows_it(name):
             DEFAULT.changed(**{name: None})
 
 
-@pytest.mark.parametrize("name", knobs_of(r"(integer, )?\["))
+@pytest.mark.parametrize("name", parameters_of(r"(integer, )?\["))
 def test_a_number_is_taken_up_to_the_ends_of_its_range(name):
     low, high = map(float, re.search(r"\[([^,]+), ([^]]+)\]", RANGE_IN_WORDS[name]).groups())
     whole = RANGE_IN_WORDS[name].startswith("integer")
@@ -328,7 +328,7 @@ def test_a_number_is_taken_up_to_the_ends_of_its_range(name):
             DEFAULT.changed(**{name: low + 0.5})
 
 
-@pytest.mark.parametrize("name", [name for name in knobs_of("`") if name != "decoder"])
+@pytest.mark.parametrize("name", [name for name in parameters_of("`") if name != "decoder"])
 def test_a_choice_is_one_of_those_in_its_range_the_first_by_default(name):
     choices = re.findall(r"`([^`]+)`", RANGE_IN_WORDS[name])
     assert choices[0] == getattr(DEFAULT, name) and len(choices) > 1
@@ -339,11 +339,11 @@ def test_a_choice_is_one_of_those_in_its_range_the_first_by_default(name):
 
 
 def test_flags_pairs_and_texts_are_nothing_else():
-    for name in knobs_of("bool"):
+    for name in parameters_of("bool"):
         other = not getattr(DEFAULT, name)
         assert getattr(DEFAULT.changed(**{name: other}), name) is other
-    wrong = [(name, value) for name in knobs_of("bool") for value in (0, "true")]
-    for name in knobs_of("pair"):
+    wrong = [(name, value) for name in parameters_of("bool") for value in (0, "true")]
+    for name in parameters_of("pair"):
         assert getattr(DEFAULT.changed(**{name: [0.5, 7]}), name) == (0.5, 7.0)
         wrong += [(name, value) for value in ((0.0, 1.0), (2.0, 2.0), (1.0,), 3.0)]
     for name in ("decoder", "optimizer"):
@@ -378,7 +378,7 @@ NUMBERS = {
 def test_the_ranges_of_numbers_are_those_of_the_manual():
     reported = "\n".join(parameter_lines())
     assert all(f"  [{values.replace('`', '')}]  " in reported for values in NUMBERS.values())
-    assert {name: RANGE_IN_WORDS[name] for name in knobs_of(r"(integer, )?\[")} == NUMBERS
+    assert {name: RANGE_IN_WORDS[name] for name in parameters_of(r"(integer, )?\[")} == NUMBERS
 
 
 def test_weights_are_numbers_from_0_by_names_and_stay_as_they_are():
