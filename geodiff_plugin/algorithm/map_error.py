@@ -11,10 +11,12 @@ import math
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.constants import MAX_PRIOR_ERROR, MIN_PRIOR_ERROR
 from geodiff_plugin.algorithm.match_fitting import MeasuredError
+from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import CostVolume, Matches
 from geodiff_plugin.matching.consistency import window_mean
 
@@ -28,6 +30,8 @@ CONTRADICTED = 0.25, 0.5
 LARGER = 2.0, 4.0
 #: Half side of that window, as a fraction of the longer image side: half a held-out block.
 WINDOW = 0.04
+#: Cells across half a window; windows are averaged over cells, because averaging over pixels takes longer.
+CELLS = 4
 #: Confidence of a window that is added to its matches', so that a few matches contradict nothing.
 PRIOR_CONFIDENCE = 0.2
 #: Ratio of the contradicted areas with matches in front of the map and behind it, below which the matches
@@ -59,22 +63,32 @@ def regional_error(measured: MeasuredError, target: Matches, volumes: Sequence[C
     """
     confidence = target.confidence.clamp_max(1.0)
     deviation = measured.deviation
-    against = confidence * _contradiction(deviation, target, volumes)
-    in_front = against * (deviation < 0)
+    contradicting = confidence * _contradiction(deviation, target, volumes)
     size = deviation.abs().clamp_max(LARGEST)
-    radius = max(1, round(WINDOW * max(target.size)))
-    layers = torch.cat([against, in_front, against * size, confidence], 1)
-    against, in_front, size, total = window_mean(layers, radius).split(1, 1)
-    local = (SD_PER_MEAN * size / against.clamp_min(1e-6)).clamp(MIN_PRIOR_ERROR, MAX_PRIOR_ERROR)
+    means = _window_means(contradicting, contradicting * (deviation < 0), contradicting * size, confidence)
+    of_all, in_front, of_size, of_confidence = means.split(1, 1)
+    local = (SD_PER_MEAN * of_size / of_all.clamp_min(1e-6)).clamp(MIN_PRIOR_ERROR, MAX_PRIOR_ERROR)
     larger = _ramp(local / measured.error, LARGER)
-    every, front, behind = (
-        larger * _ramp(part / (total + PRIOR_CONFIDENCE), CONTRADICTED)
-        for part in (against, in_front, against - in_front)
-    )
-    front_area, behind_area = ((part * confidence).mean((2, 3), keepdim=True) for part in (front, behind))
-    counted = (front_area / (FRONT_RATIO * behind_area).clamp_min(1e-6)).clamp_max(1.0)
-    wrong = torch.where(behind > front, every * counted, every)
-    return measured.error * (local / measured.error).clamp_min(1.0) ** wrong
+
+    def wrong_by(matches: Tensor) -> Tensor:
+        return larger * _ramp(matches / (of_confidence + PRIOR_CONFIDENCE), CONTRADICTED)
+
+    wrong, front, behind = wrong_by(of_all), wrong_by(in_front), wrong_by(of_all - in_front)
+    front_area = (front * of_confidence).mean((2, 3), keepdim=True)
+    behind_area = (behind * of_confidence).mean((2, 3), keepdim=True)
+    weight_behind = (front_area / (FRONT_RATIO * behind_area).clamp_min(1e-6)).clamp_max(1.0)
+    wrong = torch.where(behind > front, wrong * weight_behind, wrong)
+    ratio = (local / measured.error).clamp_min(1.0) ** wrong
+    return measured.error * F.interpolate(ratio, target.size, mode="bilinear", align_corners=False)
+
+
+def _window_means(*layers: Tensor) -> Tensor:
+    """Average layers ``(B, 1, h, w)`` over windows, ``(B, len(layers), cells down, cells across)``."""
+    longer = max(image_size(layers[0]))
+    cell = max(1, round(WINDOW / CELLS * longer))
+    size = [math.ceil(side / cell) for side in image_size(layers[0])]
+    radius = max(1, round(WINDOW * longer / cell))
+    return window_mean(F.interpolate(torch.cat(layers, 1), size, mode="area"), radius)
 
 
 def _contradiction(deviation: Tensor, target: Matches, volumes: Sequence[CostVolume]) -> Tensor:

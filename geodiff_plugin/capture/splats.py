@@ -113,7 +113,7 @@ def _write_frame(
     depth = found.depth
     entries = {} if original is None else dict(original.frames.get(frame.image, {}))
     named = entries.get("file_path", frame.name)
-    entries = {key: value for key, value in entries.items() if key not in (*REPLACED_OF_FRAME, *NERF_CAMERA)}
+    entries = {key: value for key, value in entries.items() if key not in REPLACED_OF_FRAME}
     entries.pop("mask_path", None)  # of the image before undistortion, and without overlays
     if (valid := capture.valid(frame.name)) is not None:
         entries["mask_path"] = _write_mask(folder, "masks", frame.name, valid * np.uint8(255))

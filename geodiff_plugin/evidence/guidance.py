@@ -474,9 +474,11 @@ class GeometryGuidance:
 
         The call finds it in ``evidence_store``, which this method creates; no image may be modified before.
         """
-        lefts_01 = left_images(left).to(device)
+        lefts = in_stored_pixels(left) if self.as_stored else left
+        lefts_01 = left_images(lefts)
         self.check_left_images(lefts_01)
-        lefts_01, masked = self.with_valid_pixels(lefts_01, left_alphas(left))
+        lefts_01, masked = self.with_valid_pixels(lefts_01, left_alphas(lefts))
+        lefts_01 = lefts_01.to(device)
         masked.evidence_store = self.evidence_store = EvidenceStore(len(lefts_01), copies=False)
         return masked.plan_evidence(lefts_01)
 

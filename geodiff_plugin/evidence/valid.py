@@ -88,17 +88,23 @@ def as_mask(value: Any, name: str, size: tuple[int, int]) -> Tensor | None:
 
 
 def read_mask(path: Path, name: str, size: tuple[int, int], *, scaled: bool = False) -> Tensor | None:
-    """Read ``as_mask`` from an image file; ``scaled`` allows another size of the same shape.
+    """Read the valid pixels ``(H, W)`` of an image of ``size`` from a file, as ``as_mask`` does.
 
-    ``name`` is for errors.
+    With ``scaled``, the file may have another resolution of the same aspect ratio. ``name`` is for errors.
     """
     with open_image(path, name) as image:
-        image.load()
-        height, width = image.height, image.width
-        if not scaled or round(height * size[1] / width) != size[0]:
-            return as_mask(image, name, size)
-        mask = as_mask(image, name, (height, width))
-    return None if mask is None else resized_mask(mask, size)
+        image.load()  # the file is closed below
+        own_size = image.height, image.width
+        if scaled and _have_same_aspect(own_size, size):
+            mask = as_mask(image, name, own_size)
+            return None if mask is None else resized_mask(mask, size)
+        return as_mask(image, name, size)
+
+
+def _have_same_aspect(first: tuple[int, int], second: tuple[int, int]) -> bool:
+    """Whether the smaller of two sizes ``(H, W)`` is the larger one scaled down, up to rounding."""
+    (height, width), larger = sorted([first, second])
+    return abs(larger[0] * width / larger[1] - height) < 1
 
 
 def undistorted_mask(image_01: np.ndarray, valid: Tensor | None, camera: Camera) -> Tensor | None:

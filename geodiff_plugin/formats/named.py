@@ -98,6 +98,8 @@ SIDE_LENGTHS = ("image_width", "image_height")
 MAY_DIFFER = ("K", "D", "P", "image_size", *SIDE_LENGTHS)
 #: Maximum ratio of distances between principal point and image centre that decides between two size orders.
 CLEARLY = 0.5
+#: Numbers of values of matrices listed in a message: vectors of 3, distortion, 3x3, 3x4 and 4x4 matrices.
+SIZES = (3, 4, 5, 8, 9, 12, 14, 16)
 #: Maximum number of matrices in a message.
 MAX_LISTED = 8
 RENAME = (
@@ -160,17 +162,23 @@ def _in_metres(fits: Arrays) -> Arrays:
 
 
 def _lenses(arrays: Arrays, named: Entries) -> list[Any]:
-    """Return ``D1`` and ``D2``, or none; raise if one is missing, since it would count as zero."""
-    given = [named[name] for name in ("D1", "D2") if name in named]
-    others = [key for key, v in arrays if "dist" in key and v.size > 1 and not any(v is d for d in given)]
-    if len(given) < 2 and (others or np.any(given)):
-        hint = (
-            "Rename lens distortion to D1 and D2 (zeros for no distortion), and other matrices differently."
-        )
-        bad_value(
-            "the lens distortion", "given for both cameras (D1, D2)", ", ".join(others) or "one of them", hint
-        )
-    return given if len(given) == 2 else [(), ()]
+    """Return the distortion coefficients of both cameras, empty if the file has none.
+
+    A file that has some, but not as ``D1`` and ``D2``, is an error: they would silently count as zero.
+    """
+    if named.keys() >= {"D1", "D2"}:
+        return [named["D1"], named["D2"]]
+    single = [named[name] for name in ("D", "D1", "D2") if name in named]
+    unrecognised = [
+        key
+        for key, value in arrays
+        if "dist" in squeezed(key) and value.size > 1 and not any(value is each for each in single)
+    ]
+    if unrecognised or any(each.any() for each in single):
+        got = ", ".join(unrecognised) or "for one of them"
+        hint = "Name lens distortion D1 and D2 (zeros for no distortion), and other matrices differently."
+        bad_value("the lens distortion", "given for both cameras (D1, D2)", got, hint)
+    return [(), ()]
 
 
 def read_named(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -190,7 +198,7 @@ def read_named(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     elif "baseline" in named and not named.keys() & {"R", "T"} and not _is_posed(named):
         return _parallel(named, arrays, size)
     else:
-        _raise_missing(named, arrays)
+        _check_complete(named, arrays)
         lenses = zip(("K1", "K2"), _lenses(arrays, named), strict=True)
         left, right = (RawCamera(_matrix(named[name], name), size, lens) for name, lens in lenses)
         rig = make_rig(left, right, _pose(named))
@@ -277,15 +285,16 @@ def _pose(named: Entries) -> np.ndarray:
     return np.linalg.inv(transform(R, named["T"], "R, T"))
 
 
-def _raise_missing(named: Entries, arrays: Arrays) -> None:
-    """Raise an error for missing cameras or pose that lists the entries found and the names expected."""
-    missing = [n for n in ("K1", "K2", *(() if _is_posed(named) else ("R", "T"))) if n not in named]
+def _check_complete(named: Entries, arrays: Arrays) -> None:
+    """Check that both cameras and their pose are given; the error lists the entries found."""
+    needed = ["K1", "K2"] if _is_posed(named) else ["K1", "K2", "R", "T"]
+    missing = [name for name in needed if name not in named]
     if not missing:
         return
     hint = f"If intrinsics and extrinsics are in several files, pass all of them. {RENAME}"
     if {"K1", "K2"} <= set(missing) and _has(dict(arrays), "K"):
         hint = "It has a single camera. Pass the stereo calibration, or K and E of the pair (--K, --E)."
-    listed = [f"{key} ({v.size})" for key, v in arrays if v.size in (3, 4, 5, 8, 9, 12, 14, 16)]
+    listed = [f"{key} ({v.size})" for key, v in arrays if v.size in SIZES]
     others = f" among {', '.join(listed[:MAX_LISTED])}" if listed else ""
     expected = "a calibration with P1, P2, or with K1, K2, R, T"
     bad_value("the file", expected, f"no {', '.join(missing)}{others}", hint)

@@ -200,7 +200,7 @@ def _header_ns(reader: Any, raw: Any) -> int:
 
 @lru_cache(maxsize=4)
 def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple[tuple[Stamp, Stamp], ...]:
-    """Return the stamps of matching images, one right image per left image, in order."""
+    """Return the stamps of both images of every pair, in order (``_simultaneous``)."""
     stamps: list[list[Stamp]] = []
     try:
         with _open_bag(path) as reader:
@@ -212,21 +212,38 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
     except Exception as error:  # any error that a damaged bag may cause
         reason = str(error).partition("\n")[0] or type(error).__name__
         bad_value("LEFT", "a whole bag", f"{path} ({reason})", "It may be truncated.")
-    pairs = []
-    free = stamps[1]
-    for left in stamps[0]:
-        at = bisect.bisect(free, left)
-        around = free[max(0, at - 1) : at + 1]
-        near = min(around, key=lambda right: abs(right.header_ns - left.header_ns), default=None)
-        if near is not None and abs(near.header_ns - left.header_ns) <= 1e9 * tolerance_s:
-            pairs.append((left, near))
-            free.remove(near)
+    pairs = _simultaneous(*stamps, tolerance_s)
     if not pairs:
         got = f"{len(stamps[0])} and {len(stamps[1])} images, none within {tolerance_s:g} s of each other"
         bad_value(
             "--left-topic, --right-topic", "topics of simultaneous images", got, "Pass a larger --tolerance."
         )
     return tuple(pairs)
+
+
+def _simultaneous(lefts: list[Stamp], rights: list[Stamp], tolerance_s: float) -> list[tuple[Stamp, Stamp]]:
+    """Return pairs of images that are each other's nearest in time, within a tolerance of their headers.
+
+    Both lists are sorted. If one camera lost a frame, the other's frame is left out.
+    """
+    pairs = []
+    for left in lefts:
+        right = _nearest(rights, left)
+        if right is None or abs(right.header_ns - left.header_ns) > 1e9 * tolerance_s:
+            continue
+        if _nearest(lefts, right) == left:
+            pairs.append((left, right))
+    return pairs
+
+
+def _nearest(stamps: list[Stamp], to: Stamp) -> Stamp | None:
+    """Return the nearest stamp by header, or by recording time if headers are equal; ``None`` if none."""
+
+    def distance(stamp: Stamp) -> tuple[int, int]:
+        return abs(stamp.header_ns - to.header_ns), abs(stamp.recorded_ns - to.recorded_ns)
+
+    at = bisect.bisect(stamps, to)
+    return min(stamps[max(0, at - 1) : at + 1], key=distance, default=None)
 
 
 class BagReader(AbstractContextManager["BagReader"]):

@@ -85,7 +85,7 @@ Frame = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class TransformsFile:
-    """Entries of a file other than cameras: ``shared`` by all frames, and per frame by its image."""
+    """Entries of a file other than intrinsics: ``shared`` by all frames, and per frame by its image."""
 
     path: Path
     shared: dict[str, Any]
@@ -212,17 +212,16 @@ def transforms_of(path: Path, images_at: Path | None = None) -> TransformsFile |
     data = json.loads(read_text(file, "PATH"))
     frames = [frame for frame in data["frames"] if "file_path" in frame]
     images = _images(frames, file, images_at)
-    of_image: dict[Path, Frame] = {}
+    frame_of: dict[Path, Frame] = {}
     for name, frame in zip(images.names, frames, strict=True):
         if (image := images.file(name)) is not None:
-            of_image.setdefault(image, frame)
-    shared = {k: v for k, v in data.items() if k not in ("frames", *NERF_CAMERA, *OTHERS_OF_CAMERA)}
-    without = ("file_path", *OTHERS_OF_CAMERA)
-    of_image = {
-        image: {"file_path": frame["file_path"]} | {k: v for k, v in frame.items() if k not in without}
-        for image, frame in of_image.items()
-    }
-    return TransformsFile(file, shared, of_image)
+            frame_of.setdefault(image, _without_intrinsics(frame))
+    del data["frames"]
+    return TransformsFile(file, _without_intrinsics(data), frame_of)
+
+
+def _without_intrinsics(entries: Frame) -> Frame:
+    return {key: value for key, value in entries.items() if key not in (*NERF_CAMERA, *OTHERS_OF_CAMERA)}
 
 
 def _images(frames: Iterable[Frame], file: Path, images_at: Path | None) -> Images:

@@ -207,8 +207,13 @@ class EvenShifts:
         """Return the column at which a plane begins in the image of its phase."""
         return self.columns[plane] // _PHASES - self.first
 
-    def lines(self, phase: tuple[int, int], height: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows and columns of the canvas, with a margin, that make the image of a phase; float32."""
+    def positions(self, phase: tuple[int, int], height: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows and columns of the canvas, float32, at which the image of a phase is sampled.
+
+        These are ``height`` rows of the left grid, shifted, and the columns that the planes read together,
+        both with ``MARGIN_PX`` more at each end. Rows of the margin repeat the outermost row, as in
+        ``AlignedView.positions``. Columns do not, because planes that begin elsewhere share the image.
+        """
         column, row = phase
         rows = np.arange(-MARGIN_PX, height + MARGIN_PX, dtype=np.float32).clip(0, height - 1)
         columns = np.arange(-MARGIN_PX, self.count + MARGIN_PX, dtype=np.float32)
@@ -259,8 +264,8 @@ class ComparedView:
         """Compute the right view's ``census`` for all shifts of a phase, int8; cached per row."""
         if phase not in self._phases:
             self._phases = {key: parts for key, parts in self._phases.items() if key[1] == phase[1]}
-            lines = shifts.lines(phase, self._left.shape[1])
-            rows, columns = (to_device_of(self._left, each) for each in lines)
+            positions = shifts.positions(phase, self._left.shape[1])
+            rows, columns = (to_device_of(self._left, each) for each in positions)
             self._phases[phase] = census(_resampled(self._view.grey, rows, columns)).to(torch.int8)
         return self._phases[phase]
 

@@ -101,6 +101,25 @@ class Refined(NamedTuple):
     features: ConfidenceFeatures  # confidence features
 
 
+class _Maps(NamedTuple):
+    """Full-size maps ``(1, 1, H, W)`` of a result; the last two are ``None`` without matches and points."""
+
+    depth_m: Tensor
+    uncertainty: Tensor | None  # metres; ``None`` if not requested
+    confidence: Tensor | None = None
+    support: Tensor | None = None
+
+
+class _CheckedMaps(NamedTuple):
+    """Maps of one image that the checks use."""
+
+    result: _Maps
+    relative: Tensor
+    visible: Tensor | None
+    over_prior: Tensor | None
+    prior_error: Tensor | None
+
+
 def finish(
     evidence: Evidence,
     members: Sequence[Member],
@@ -119,60 +138,48 @@ def finish(
     """
     native = evidence.native
     depth_m = depth_m.float().to(native.left.image_01.device)
-    depth_m, uncertainty = _one_map(members, depth_m, uncertainty, options)
-    left = native.left.resized(image_size(depth_m))
-    left_01 = left.image_01[None]
-    uncertainty = None if uncertainty is None else uncertainty.to(depth_m)
-    prior_error = _error_of(members)
-    confidence = support = None
-    refined = refine(evidence, members, depth_m, left_01, options.config)
-    if refined is not None:
-        maps = _maps_of(refined, evidence, members, uncertainty, left_01, options)
-        depth_m, uncertainty, confidence, support = maps
-        del refined  # full-size maps, freed to save memory
-    visible, error = reprojection(native.rights, depth_m, left) if native.rights else (None, None)
+    maps = _one_map(members, depth_m, uncertainty, options)
+    del depth_m, uncertainty  # freed when they are refined, to save memory
+    left = native.left.resized(image_size(maps.depth_m))
+    maps = _refined(maps, evidence, members, left.image_01[None], options)
+    visible, error = reprojection(native.rights, maps.depth_m, left) if native.rights else (None, None)
     relative = median(cat_samples([member.relative for member in members]), 0)[None]
-    over_prior = _over_prior(members, depth_m)
-    stage = _stage(
-        evidence, members, _Maps(depth_m, relative, confidence, over_prior, visible, prior_error), options
+    checked = _CheckedMaps(
+        maps, relative, visible, over_prior=_over_prior(members, maps.depth_m), prior_error=_error_of(members)
     )
+    stage = _stage(evidence, members, checked, options)
     verdict = judge(evidence.facts.of_call(options.call) | measure_result(stage))
-    if confidence is not None:
-        confidence = confidence * _remaining(evidence, depth_m, left.camera, verdict.facts, options.config)
+    if maps.confidence is not None:
+        factor = _remaining(evidence, maps.depth_m, left.camera, verdict.facts, options.config)
+        maps = maps._replace(confidence=maps.confidence * factor)
     if left.valid is not None:
-        depth_m, confidence, uncertainty = _mask_result(
-            left.valid, depth_m, confidence, uncertainty, options.fill
-        )
+        maps = _masked(maps, left.valid, options.fill)
     return ImageResult(
         evidence=evidence,
-        depth_m=depth_m,
+        **maps._asdict(),
         camera=left.camera,
-        relative=_resized(relative, image_size(depth_m), antialias=False),
+        relative=_resized(relative, image_size(maps.depth_m), antialias=False),
         scale=cat_samples([member.affine.scale for member in members]),
         shift=cat_samples([member.affine.shift for member in members]),
         global_scale=cat_samples([member.affine.g_s for member in members]),
         verdict=verdict,
-        uncertainty=uncertainty,
         visible=visible,
         photometric_error=error,
-        confidence=confidence,
-        support=support,
-        prior_error=prior_error,
-        over_prior=over_prior,
-        measurable_m=_measurable_m(evidence, depth_m),
+        prior_error=checked.prior_error,
+        over_prior=checked.over_prior,
+        measurable_m=_measurable_m(evidence, maps.depth_m),
     )
 
 
-def _maps_of(
-    refined: Refined,
-    evidence: Evidence,
-    members: Sequence[Member],
-    uncertainty: Tensor | None,
-    left_01: Tensor,
-    options: ResultOptions,
-) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Return depth, uncertainty, confidence and data support ``(1, 1, H, W)`` after edge refinement."""
+def _refined(
+    maps: _Maps, evidence: Evidence, members: Sequence[Member], left_01: Tensor, options: ResultOptions
+) -> _Maps:
+    """Refine depth, and add confidence and data support; unchanged if there is nothing to fit it to."""
+    refined = refine(evidence, members, maps.depth_m, left_01, options.config)
+    if refined is None:
+        return maps
     depth_m = refined.depth_m.clamp(max=_farthest_m(evidence, options.config))
+    uncertainty = maps.uncertainty
     if uncertainty is not None:
         uncertainty = _spread_of_members(evidence, members, depth_m, left_01, options)
     spread = None if uncertainty is None else uncertainty / depth_m
@@ -180,23 +187,21 @@ def _maps_of(
     certainty = _mean(members, "certainty")
     if certainty is not None:
         confidence = confidence * F.interpolate(certainty, image_size(confidence), mode="bilinear")
-    return depth_m, uncertainty, confidence, refined.support
+    return _Maps(depth_m, uncertainty, confidence, refined.support)
 
 
-def _mask_result(
-    valid: Tensor, depth_m: Tensor, confidence: Tensor | None, uncertainty: Tensor | None, fill: bool
-) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Set depth, confidence and uncertainty to 0 where pixels are not ``valid (H, W)``, or ``fill`` them."""
+def _masked(maps: _Maps, valid: Tensor, fill: bool) -> _Maps:
+    """Set depth, uncertainty and confidence to 0 where pixels are not ``valid (H, W)``, or ``fill`` them."""
+    confidence, uncertainty = maps.confidence, maps.uncertainty
     if fill:
         if confidence is not None:
             confidence = torch.where(valid, confidence, confidence.clamp_max(FILL_CONFIDENCE))
-        return depth_m, confidence, uncertainty
-
-    def masked(values: Tensor) -> Tensor:
-        return torch.where(valid, values, 0.0)
-
-    confidence, uncertainty = (None if each is None else masked(each) for each in (confidence, uncertainty))
-    return masked(depth_m), confidence, uncertainty
+        return maps._replace(confidence=confidence)
+    return maps._replace(
+        depth_m=torch.where(valid, maps.depth_m, 0.0),
+        uncertainty=None if uncertainty is None else torch.where(valid, uncertainty, 0.0),
+        confidence=None if confidence is None else torch.where(valid, confidence, 0.0),
+    )
 
 
 def _remaining(
@@ -329,14 +334,14 @@ def _member_at(size: tuple[int, int], member: Member, like: Tensor, options: Res
 
 def _one_map(
     members: Sequence[Member], depth_m: Tensor, uncertainty: Tensor | None, options: ResultOptions
-) -> tuple[Tensor, Tensor | None]:
+) -> _Maps:
     """Return map and spread of an ensemble, as reduced by the stock call or reduced at the map's size."""
     if options.config.ensemble_at == "processing" or len(members) == 1:
-        return _within_range(depth_m, members), uncertainty
+        return _Maps(_within_range(depth_m, members), uncertainty)
     maps = torch.cat([_member_at(image_size(depth_m), member, depth_m, options) for member in members])
     lower = options.config.even_ensemble == "lower"
     reduced_m, spread_m = ensemble_metric(maps, options.reduction, lower)
-    return reduced_m, None if uncertainty is None else spread_m
+    return _Maps(reduced_m, None if uncertainty is None else spread_m)
 
 
 def _spread_of_members(
@@ -362,18 +367,9 @@ def _over_prior(members: Sequence[Member], depth_m: Tensor) -> Tensor | None:
     return (resized / cat_samples(priors_m).clamp_min(MIN_DEPTH_M)).flatten(1)
 
 
-class _Maps(NamedTuple):
-    """Maps of one image that the checks use."""
-
-    depth_m: Tensor
-    relative: Tensor
-    confidence: Tensor | None
-    over_prior: Tensor | None
-    visible: Tensor | None
-    prior_error: Tensor | None
-
-
-def _stage(evidence: Evidence, members: Sequence[Member], maps: _Maps, options: ResultOptions) -> ResultStage:
+def _stage(
+    evidence: Evidence, members: Sequence[Member], maps: _CheckedMaps, options: ResultOptions
+) -> ResultStage:
     """Collect the inputs of the checks; matches are computed here if the run used none."""
     correlations = [m.rank_correlation for m in members if m.rank_correlation is not None]
     correlations_of_members = cat_samples(correlations)
@@ -393,10 +389,10 @@ def _stage(evidence: Evidence, members: Sequence[Member], maps: _Maps, options: 
         evidence.native,
         matches,
         points,
-        maps.depth_m,
+        maps.result.depth_m,
         planes=None if volume is None else volume.inverse_depth,
         points_outside=evidence.points_outside,
-        confidence=maps.confidence,
+        confidence=maps.result.confidence,
         visible=maps.visible,
         rank_correlation=correlation,
         prior_error=None if maps.prior_error is None else maps.prior_error.amin(),

@@ -167,11 +167,15 @@ class KnownPoints(Check[Points]):
         fact = facts[cls]
         if fact is None:
             return
-        wrong = _are_wrong(fact)
-        if log_size(fact.ratio) >= cls.REMARKED_LOG_RATIO:
-            yield _factor(FACTOR if wrong else DIFFER, fact)
-        elif (fact.fraction_off or 0.0) > cls.REMARKED_OFF:
-            yield _contradict(CONTRADICT if wrong else SOME_CONTRADICT, fact)
+        log_ratio, off = log_size(fact.ratio), fact.fraction_off or 0.0
+        if log_ratio > cls.MAX_LOG_RATIO:
+            yield _factor(FACTOR, fact)
+        elif off > cls.MAX_OFF:
+            yield _contradict(CONTRADICT, fact)
+        elif log_ratio >= cls.REMARKED_LOG_RATIO:
+            yield _factor(DIFFER, fact)
+        elif off > cls.REMARKED_OFF:
+            yield _contradict(SOME_CONTRADICT, fact)
         if 0 < fact.count < cls.MIN_POINTS:
             yield _few(fact.count, alone=not MatchedFraction.has_matches(facts))
         if fact.outside:

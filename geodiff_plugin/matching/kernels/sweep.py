@@ -219,8 +219,8 @@ def _right_levels(view: AlignedView, size: tuple[int, int], planes: range) -> tu
         images, begins = list(range(len(planes))), [0] * len(planes)
     else:
         phases = sorted({shifts.phase(plane) for plane in planes})
-        lines = [shifts.lines(phase, size[0]) for phase in phases]
-        rows, columns = (np.stack(each) for each in zip(*lines, strict=True))
+        positions = [shifts.positions(phase, size[0]) for phase in phases]
+        rows, columns = (np.stack(each) for each in zip(*positions, strict=True))
         images = [phases.index(shifts.phase(plane)) for plane in planes]
         begins = [shifts.begin(plane) for plane in planes]
     area = rows.shape[1] * columns.shape[1]

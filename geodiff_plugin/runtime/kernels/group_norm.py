@@ -21,18 +21,20 @@ BUSY = 2048
 
 @triton.jit(do_not_specialize=["length", "part", "parts"])
 def moments_kernel(x, sums, length, part, parts, BLOCK: tl.constexpr):
-    """Sum the values and squares of one part of a group."""
-    group, index = tl.program_id(0), tl.program_id(1)
+    """Sum the values and squares of one part of a group. Arguments as in ``normalize_kernel``."""
+    group = tl.program_id(0)
+    index = tl.program_id(1)
     base = x + group.to(tl.int64) * length
-    one, two = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32)
+    values = tl.zeros([BLOCK], tl.float32)
+    squares = tl.zeros([BLOCK], tl.float32)
     last = tl.minimum((index + 1) * part, length)
     for first in range(index * part, last, BLOCK):
         k = first + tl.arange(0, BLOCK)
         value = tl.load(base + k, k < last, 0.0).to(tl.float32)
-        one += value
-        two += value * value
-    tl.store(sums + (group * parts + index) * 2, tl.sum(one, 0))
-    tl.store(sums + (group * parts + index) * 2 + 1, tl.sum(two, 0))
+        values += value
+        squares += value * value
+    tl.store(sums + (group * parts + index) * 2, tl.sum(values, 0))
+    tl.store(sums + (group * parts + index) * 2 + 1, tl.sum(squares, 0))
 
 
 @triton.jit(do_not_specialize=["length", "area", "channels", "groups", "part", "parts"])
@@ -40,16 +42,24 @@ def normalize_kernel(
     x, out, sums, weight, bias, length, area, channels, groups, part, parts, eps,
     PARTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Normalize one part of a group to mean 0 and variance 1, then apply the channel's weight and bias."""
-    group, index, s = tl.program_id(0), tl.program_id(1), tl.arange(0, PARTS)
+    """Normalize one part of a group to mean 0 and variance 1, then apply the channel's weight and bias.
+
+    Grid: the groups of all images, parts. An image has ``groups`` groups. A group has ``channels`` channels
+    of ``area`` values, ``length`` values in all, and is split into ``parts`` parts of ``part`` values.
+    """
+    group = tl.program_id(0)
+    index = tl.program_id(1)
+    s = tl.arange(0, PARTS)
     at = sums + (group * parts + s) * 2
     mean = tl.sum(tl.load(at, s < parts, 0.0), 0) / length
-    square = tl.sum(tl.load(at + 1, s < parts, 0.0), 0) / length
-    scale = tl.rsqrt(tl.maximum(square - mean * mean, 0.0) + eps)
-    base, last = group.to(tl.int64) * length, tl.minimum((index + 1) * part, length)
+    mean_square = tl.sum(tl.load(at + 1, s < parts, 0.0), 0) / length
+    scale = tl.rsqrt(tl.maximum(mean_square - mean * mean, 0.0) + eps)
+    base = group.to(tl.int64) * length
+    last = tl.minimum((index + 1) * part, length)
     for first in range(index * part, last, BLOCK):
         k = first + tl.arange(0, BLOCK)
-        inside, channel = k < last, (group % groups) * channels + k // area
+        inside = k < last
+        channel = (group % groups) * channels + k // area
         gain = tl.load(weight + channel, inside, 0.0).to(tl.float32) * scale
         value = (tl.load(x + base + k, inside, 0.0).to(tl.float32) - mean) * gain
         value += tl.load(bias + channel, inside, 0.0).to(tl.float32)

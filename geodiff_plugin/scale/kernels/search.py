@@ -20,7 +20,16 @@ from geodiff_plugin.matching.census import COST_LEVELS
 from geodiff_plugin.scale import constants
 from geodiff_plugin.scale.affine import MetricForm
 from geodiff_plugin.scale.kernels.points import value_at
-from geodiff_plugin.scale.kernels.space import ends, floored_of, forward, inverse
+from geodiff_plugin.scale.kernels.space import (
+    DEPTH,
+    DISPARITY,
+    LOG,
+    LOG1P,
+    ends,
+    floored_of,
+    forward,
+    inverse,
+)
 from geodiff_plugin.scale.sampling import basin_stride, group_size, min_in_view
 
 # Triton kernels can read module constants only as constexpr.
@@ -68,27 +77,27 @@ def _log1p(y):
 @triton.jit
 def _scale_and_shift(near, far, FORM: tl.constexpr):
     """Compute ``Space.from_ends`` of a range, with scale and shift clamped as in ``MetricMap.from_range``."""
-    a, b = ends(near, far, FORM)
-    if FORM == 0:
-        g = b
-        t = a / b
-        s = (b - a) / b
-    elif FORM == 1:
-        g = tl.sqrt(a * b)
-        t = g / a
-        s = g / b - t
-    elif FORM == 2:
-        g = a * 0.9
-        t = tl.log(a / g)
-        s = tl.log(b / a)
-    elif FORM == 3:
-        g = tl.zeros_like(a) + 1.0
-        t = tl.log(1.0 + a)
-        s = tl.log(1.0 + b) - t
+    at_zero, at_one = ends(near, far, FORM)
+    if FORM == DEPTH:
+        g = at_one
+        t = at_zero / at_one
+        s = (at_one - at_zero) / at_one
+    elif FORM == DISPARITY:
+        g = tl.sqrt(at_zero * at_one)
+        t = g / at_zero
+        s = g / at_one - t
+    elif FORM == LOG:
+        g = at_zero * 0.9  # the shift must stay positive, as in the reference
+        t = tl.log(at_zero / g)
+        s = tl.log(at_one / at_zero)
+    elif FORM == LOG1P:
+        g = tl.zeros_like(at_zero) + 1.0
+        t = tl.log(1.0 + at_zero)
+        s = tl.log(1.0 + at_one) - t
     else:
-        g = tl.sqrt(a * b)
-        t = tl.sqrt(g / a)
-        s = tl.sqrt(g / b) - t
+        g = tl.sqrt(at_zero * at_one)
+        t = tl.sqrt(g / at_zero)
+        s = tl.sqrt(g / at_one) - t
     return tl.maximum(s, _MIN_FRACTION), tl.maximum(t, _MIN_FRACTION), g
 
 

@@ -13,6 +13,9 @@ from geodiff_plugin.scale.constants import FLOOR_EPS, KERNEL_FORMS, SQUARE
 
 # Triton kernels can read module constants only as constexpr.
 _EPS = tl.constexpr(FLOOR_EPS)
+DEPTH, DISPARITY, LOG, LOG1P, SQRT_DISPARITY = (
+    tl.constexpr(KERNEL_FORMS[name]) for name in ("depth", "disparity", "log", "log1p", "sqrt_disparity")
+)
 #: Pixels per program.
 PIXELS = 1024
 #: Kernel mode: ``smooth_floor``.
@@ -27,13 +30,13 @@ _FLOORED, _METRIC = tl.constexpr(FLOORED), tl.constexpr(METRIC)
 @triton.jit
 def forward(v, FORM: tl.constexpr):
     """Compute ``Space.forward`` for a global scale of 1."""
-    if FORM == 0:
+    if FORM == DEPTH:
         depth = v
-    elif FORM == 1:
+    elif FORM == DISPARITY:
         depth = 1.0 / v
-    elif FORM == 2:
+    elif FORM == LOG:
         depth = tl.exp(v)
-    elif FORM == 3:
+    elif FORM == LOG1P:
         depth = tl.exp(v) - 1.0
     else:
         depth = 1.0 / (v * v)
@@ -43,13 +46,13 @@ def forward(v, FORM: tl.constexpr):
 @triton.jit
 def inverse(depth, FORM: tl.constexpr):
     """Compute ``Space.inverse``."""
-    if FORM == 0:
+    if FORM == DEPTH:
         v = depth
-    elif FORM == 1:
+    elif FORM == DISPARITY:
         v = 1.0 / depth
-    elif FORM == 2:
+    elif FORM == LOG:
         v = tl.log(depth)
-    elif FORM == 3:
+    elif FORM == LOG1P:
         v = tl.log(1.0 + depth)
     else:
         v = 1.0 / tl.sqrt(depth)
@@ -59,7 +62,7 @@ def inverse(depth, FORM: tl.constexpr):
 @triton.jit
 def ends(near, far, FORM: tl.constexpr):
     """Return ``Space.ends``: swapped for spaces that fall with depth."""
-    if (FORM == 1) or (FORM == 4):
+    if (FORM == DISPARITY) or (FORM == SQRT_DISPARITY):  # noqa: SIM109 - Triton has no ``in``
         at_zero, at_one = far, near
     else:
         at_zero, at_one = near, far

@@ -87,7 +87,8 @@ def scene(deviation: torch.Tensor, rise=60.0, best=5.0, error=0.01, in_view=None
     match = torch.full_like(deviation, FIRST + 5 * STEP)
     target = Matches(match, torch.full_like(match, 0.9), torch.tensor([STEP]))
     planes = torch.arange(PLANES).view(-1, 1, 1)
-    levels = (rise * (planes - best).abs()).clamp_max(220).to(torch.uint8).expand(-1, *GRID)
+    levels = (rise * (planes - best).abs()).clamp_max(220).to(torch.uint8)
+    levels = levels.expand(-1, *deviation.shape[2:])
     measured = MeasuredError(torch.tensor(error).view(1, 1, 1, 1), deviation)
     return regional_error(measured, target, [volume_of(levels.contiguous(), in_view)])
 
@@ -98,8 +99,11 @@ def patch(value: float, columns: slice = slice(20, 40)) -> torch.Tensor:
     return deviation
 
 
-def test_a_wrong_patch_has_its_own_error_and_the_rest_keeps_the_maps():
-    found = scene(patch(-0.4))
+@pytest.mark.parametrize("factor", [1, 4], ids=["a cell per pixel", "cells of two pixels"])
+def test_a_wrong_patch_has_its_own_error_and_the_rest_keeps_the_maps(factor):
+    large = scene(patch(-0.4).repeat_interleave(factor, 2).repeat_interleave(factor, 3))
+    assert large.shape == (1, 1, GRID[0] * factor, GRID[1] * factor)
+    found = large[..., ::factor, ::factor]
     assert found[..., 13:27, 23:37].numpy() == pytest.approx(0.4 * np.sqrt(np.pi / 2), rel=0.01)
     outside = torch.ones(GRID, dtype=torch.bool)
     outside[7:33, 17:43] = False

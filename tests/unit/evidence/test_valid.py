@@ -20,6 +20,7 @@ from geodiff_plugin.evidence.valid import (
     content_mask,
     filled,
     neutral_views,
+    read_mask,
 )
 from tests.tiny import render_plane
 
@@ -204,3 +205,21 @@ def test_the_dark_parts_of_a_scene_are_valid(name):
 
 def test_a_black_image_has_no_border():
     assert content_mask(torch.zeros(3, *SIZE)) is None
+
+
+@pytest.mark.parametrize("size", [(270, 480), (135, 240), (2158, 3840), (1079, 1920)])
+def test_a_mask_of_another_resolution_may_be_rounded(size, tmp_path):
+    """The smaller size is the larger one divided, and rounded in either direction."""
+    half = np.arange(size[1])[None].repeat(size[0], 0) < size[1] // 2
+    Image.fromarray(half.astype(np.uint8) * 255).save(tmp_path / "mask.png")
+    mask = read_mask(tmp_path / "mask.png", "mask", (1079, 1920), scaled=True)
+    assert mask.shape == (1079, 1920) and abs(mask.float().mean() - 0.5) < 0.01
+
+
+@pytest.mark.parametrize("size", [(266, 480), (274, 480), (480, 270), (2162, 3840)])
+def test_a_mask_of_another_aspect_ratio_is_rejected(size, tmp_path):
+    Image.fromarray(np.eye(*size, dtype=np.uint8) * 255).save(tmp_path / "mask.png")
+    with pytest.raises(
+        InputError, match=f"mask must be 1920x1079 pixels, like its image; got {size[1]}x{size[0]}"
+    ):
+        read_mask(tmp_path / "mask.png", "mask", (1079, 1920), scaled=True)

@@ -287,13 +287,15 @@ def test_unit_suffixes_of_names_are_applied(unit, factor):
 def test_distortion_under_unknown_names_is_rejected():
     sentence = (
         r"\Athe lens distortion must be given for both cameras \(D1, D2\); got {}\. "
-        r"Rename lens .* differently\.\Z"
+        r"Name lens .* differently\.\Z"
     )
     entries = CAMERAS | POSE
     for change, got in (
-        ({"D2": None}, "one of them"),
+        ({"D2": None}, "for one of them"),
         ({"D2": None, "distort_of_right": LENS_RIGHT}, "distort_of_right"),
         ({"D1": None, "D2": None, "distances": [1, 2]}, "distances"),
+        ({"D1": None, "D2": None, "DistortionOfRight": LENS_RIGHT}, "distortionofright"),
+        ({"D1": None, "D2": None, "D": LENS_RIGHT}, "for one of them"),
     ):
         with pytest.raises(InputError, match=sentence.format(got)):
             read(entries | change)

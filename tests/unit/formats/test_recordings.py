@@ -136,7 +136,7 @@ TOPICS = ("/a/image", "/b/image")
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".bag", ""])
-def test_every_left_image_has_the_nearest_right_one_that_is_free(suffix, tmp_path):
+def test_every_left_image_has_the_nearest_right_one(suffix, tmp_path):
     """Recorded out of order, with two right images between two left ones, and one that is too far off."""
     lefts = [(0, 9), (100, 110), (200, 205), (300, 301), (400, 402)]
     rights = [(104, 120), (97, 98), (203, 204), (196, 230), (312, 313), (-11, 1), (399, 500)]
@@ -168,6 +168,27 @@ def test_every_left_image_has_the_nearest_right_one_that_is_free(suffix, tmp_pat
 def test_one_right_image_is_of_one_pair_only(tmp_path):
     path = bag(tmp_path / "a.mcap", {TOPICS[0]: [(0, 0), (4, 4)], TOPICS[1]: [(2, 2)]})
     assert [(pair[0].header_ns - START) // 10**6 for pair in list_pairs(path, TOPICS, 0.005)] == [0]
+
+
+def test_a_lost_image_does_not_shift_the_later_pairs(tmp_path):
+    lefts, rights = ([(ms, ms) for ms in times] for times in ((0, 33, 66, 99), (0, 66, 99)))
+    path = bag(tmp_path / "a.mcap", dict(zip(TOPICS, (lefts, rights), strict=True)))
+    for tolerance in (0.005, 0.05):
+        pairs = list_pairs(path, TOPICS, tolerance)
+        assert [[(stamp.header_ns - START) // 10**6 for stamp in pair] for pair in pairs] == [
+            [0, 0],
+            [66, 66],
+            [99, 99],
+        ]
+
+
+def test_images_with_equal_headers_are_matched_by_recording_time(tmp_path):
+    lefts, rights = ([(0, ms) for ms in times] for times in ((0, 30, 60), (2, 29, 61)))
+    path = bag(tmp_path / "a.mcap", dict(zip(TOPICS, (lefts, rights), strict=True)))
+    recorded = [
+        [(stamp.recorded_ns - START) // 10**6 for stamp in pair] for pair in list_pairs(path, TOPICS, 0)
+    ]
+    assert recorded == [[0, 2], [30, 29], [60, 61]]
 
 
 def test_both_images_of_a_pair_must_be_of_one_size(tmp_path):
@@ -292,18 +313,19 @@ def test_sigma_is_a_message_of_the_same_stamp_and_encoding_rounded_up_in_millime
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_pairs_are_those_of_a_search_through_all_free_images(seed, tmp_path):
-    """In the order of the left images each has the nearest right one that is free, the earlier of two."""
+def test_the_images_of_a_pair_are_each_others_nearest_of_all(seed, tmp_path):
+    """The earlier one of two at the same distance."""
     rng = np.random.default_rng(seed)
     lefts, rights = (sorted(rng.choice(250, count, replace=False).tolist()) for count in (13, 15))
     stamps = {topic: [(at, at + 1) for at in ms] for topic, ms in zip(TOPICS, (lefts, rights), strict=True)}
     path = bag(tmp_path / "a.mcap", {topic: rng.permutation(each).tolist() for topic, each in stamps.items()})
-    expected, free = [], list(rights)
-    for left in lefts:
-        near = min(free, key=lambda right: abs(right - left), default=None)
-        if near is not None and abs(near - left) <= 12:
-            expected.append((left, near))
-            free.remove(near)
+    distance = np.abs(np.subtract.outer(lefts, rights))
+    nearest_right, nearest_left = distance.argmin(1), distance.argmin(0)
+    expected = [
+        (lefts[n], rights[m])
+        for n, m in enumerate(nearest_right)
+        if nearest_left[m] == n and distance[n, m] <= 12
+    ]
     found = [tuple((s.header_ns - START) // 10**6 for s in pair) for pair in list_pairs(path, TOPICS, 0.012)]
     assert found == expected and 4 < len(expected) < 13
 

@@ -388,9 +388,8 @@ def test_non_camera_entries_are_returned_by_image(scan):
     assert_is_an_immutable_record(read)
     assert list(read.frames) == files[:2]
     for image, n in ((files[0], 0), (files[1], 1)):
-        expected = frame(n, extra=n + 1)
-        del expected["k3"], expected["k4"]
-        assert read.frames[image] == expected
+        assert set(read.frames[image]) == {"file_path", "transform_matrix", "extra"}
+        assert read.frames[image]["extra"] == n + 1
     assert transforms.transforms_of(scan / "none") is None
     moved = write_images(scan / "else", ["a.png"])
     assert list(transforms.transforms_of(scan, scan / "else").frames) == moved
