@@ -150,8 +150,8 @@ def test_the_page_of_messages_is_up_to_date():
     check_generated(PAGE, BEGIN, _tables(), END)
 
 
-def test_troubleshooting_names_codes_that_exist():
+def test_debugging_page_names_codes_that_exist():
     """A word in code style that begins with a group, followed by a dot, is a code if it is no file."""
-    text = (DOCS / "how-to" / "troubleshooting.md").read_text(encoding="utf-8")
-    named = set(re.findall(rf"`((?:{'|'.join(GROUPS)})\.(?!npy|csv)[a-z-]+)`", text))
+    text = (DOCS / "how-to" / "debugging-a-pair.md").read_text(encoding="utf-8")
+    named = set(re.findall(rf"`((?:{'|'.join(GROUPS)})\.(?!npy|csv|png)[a-z-]+)`", text))
     assert len(named) > 10 and named <= set(KINDS), named - set(KINDS)
