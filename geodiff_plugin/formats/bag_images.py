@@ -122,6 +122,10 @@ def _decode_raw(message: Any, data: np.ndarray, path: Path) -> np.ndarray:
 
 def both_as_01(images: Sequence[np.ndarray], path: Path) -> list[np.ndarray]:
     """Convert images of one moment to float32 in [0, 1], with the bit depth that the brighter one needs."""
+    kinds = {str(image.dtype) for image in images}
+    if len(kinds) > 1:
+        hint = "Record both topics with the same encoding."
+        bad_value("the images of a pair", "of one type", f"{' and '.join(sorted(kinds))} in {path}", hint)
     maximum = max(float(image.max()) for image in images)
     if images[0].dtype.kind == "f":
         full = 1.0 if maximum <= 1.0 else 255.0

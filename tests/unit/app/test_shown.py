@@ -172,6 +172,7 @@ def test_a_3d_view_leaves_out_flying_points_and_what_is_far_behind_all_others():
 
 def test_a_stored_result_has_every_part(tmp_path):
     shown = made_result()
+    shown.sigma_m[2, 3:5] = np.nan
     Image.fromarray(shown.image).resize((88, 60)).save(tmp_path / "left.png")
     save(tmp_path / "a.npz", shown, [(3, 4), (7, 9)])
     again, pixels = load(tmp_path / "a.npz", tmp_path / "left.png", "an example")

@@ -707,6 +707,7 @@ def test_a_mesh_is_made_of_the_kept_pixels_of_all_frames_by_their_own_cameras(tm
     io = SimpleNamespace(write_triangle_mesh=write)
     monkeypatch.setitem(sys.modules, "open3d", SimpleNamespace(core=core, t=tensors, io=io))
     frames = {name: doubted(number) for number, name in enumerate(NAMES)}
+    frames[NAMES[0]].confidence[:] = 0  # a frame without depth, which Open3D would reject
     write_mesh(tmp_path / "mesh.ply", NAMES, frames.__getitem__, lambda name: image_of(NAMES.index(name)))
     points, colours = [], []
     for number, frame in enumerate(frames.values()):

@@ -131,6 +131,30 @@ def test_scenes_are_of_the_set_that_ground_truth_and_folders_name(tmp_path):
     assert other["mask"] == "two_view_training_gt/y/mask0nocc.png"
 
 
+def test_the_depth_of_a_scene_follows_from_both_cameras(tmp_path):
+    """Their principal points differ (doffs), and pixels that are occluded in the right view are marked."""
+    rng = np.random.default_rng(0)
+    disparity = rng.uniform(2, 6, LARGE).astype(np.float32)
+    disparity[2, 3:6] = np.inf
+    mask = np.full(LARGE, 255, np.uint8)
+    mask[5, 1:4] = 128
+    folder = tmp_path / "m/Scene"
+    folder.mkdir(parents=True)
+    write_pfm(folder / "disp0.pfm", disparity)
+    Image.fromarray(mask).save(folder / "mask0nocc.png")
+    for name in ("im0", "im1"):
+        Image.fromarray(rng.integers(0, 255, (*LARGE, 3), dtype=np.uint8)).save(folder / f"{name}.png")
+    (folder / "calib.txt").write_text(
+        "cam0=[30 0 9.5; 0 30 5.5; 0 0 1]\ncam1=[30 0 12; 0 30 5.5; 0 0 1]\ndoffs=2.5\nbaseline=250\n"
+        f"width={LARGE[1]}\nheight={LARGE[0]}\n"
+    )
+    sample = load(find_pairs(tmp_path, ["middlebury2014"])[0])
+    known = np.isfinite(disparity)
+    np.testing.assert_array_equal(sample.valid, known)
+    np.testing.assert_allclose(sample.depth_m[known], 30 * 0.25 / (disparity[known] + 2.5), rtol=1e-5)
+    np.testing.assert_array_equal(sample.occluded, mask == 128)
+
+
 def test_booster_has_a_pair_of_every_lighting(tmp_path):
     touch(
         tmp_path,
@@ -238,6 +262,7 @@ def test_own_folders_prefer_png_and_report_what_is_missing(tmp_path):
         "a/left.txt",
         "a/right.webp",
         "a/calib.yaml",
+        "a/calib.yml",
         "a/depth.pfm",
         "a/depth.png",
     )

@@ -210,6 +210,13 @@ def test_views_of_floats_are_fractions_or_levels():
     assert bytes_01[0][0, 0, 0] == np.float32(0.2) and bytes_01[1][0, 0, 0] == pytest.approx(3 / 255)
 
 
+def test_views_of_two_types_are_rejected():
+    images = [np.zeros((2, 2, 3), kind) for kind in (np.uint8, np.uint16)]
+    for pair in (images, images[::-1]):
+        with pytest.raises(InputError, match="images of a pair must be of one type; got uint16 and uint8 in"):
+            both_as_01(pair, PATH)
+
+
 def test_the_warning_on_few_bits_points_at_the_line_that_reads_the_bag():
     images = [np.full((2, 3, 3), 500, np.uint16)] * 2
     with pytest.warns(UserWarning) as caught:

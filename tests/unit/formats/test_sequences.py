@@ -173,6 +173,9 @@ def test_replica_has_one_pose_per_line_and_a_shared_camera(tmp_path, above):
         InputError, match=r"\A\S*traj\.txt must be a file with 3 lines, one per image; got 2\."
     ):
         sequences.read_replica(scene)
+    (scene / "traj.txt").write_text("1,5 2,5 3,0\n")
+    with pytest.raises(InputError, match=r"traj\.txt must be numbers with a decimal point; got .*1,5"):
+        sequences.read_replica(scene)
     (scene / "traj.txt").unlink()
     assert sequences.read_replica(scene) is None
 

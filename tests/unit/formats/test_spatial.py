@@ -69,7 +69,7 @@ def photo(
         box(b"grpl", full(group, 0, members)),
     ]
     path.write_bytes(
-        box(b"ftyp", b"heic" + bytes(12)) + full(b"meta", 0, b"".join(parts)) + box(b"mdat", b"pixels")
+        box(b"ftyp", b"heic" + bytes(12)) + full(b"meta", 0, b"".join(parts)) + box(b"mdat", bytes(99))
     )
     return path
 

@@ -295,6 +295,21 @@ def test_features_of_a_frame_are_colmaps_pixels_scales_and_angles(factor):
     assert np.abs(descriptors - np.minimum(root, 255)).max() <= 0.51
 
 
+def test_features_touch_no_masked_pixel():
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (120, 160)).astype(np.uint8), (0, 0), 1.5)
+    valid = np.ones(image.shape, bool)
+    valid[30:80, 50:120] = False
+    every, of_every = _features(image, (160, 120))
+    px, descriptors = _features(np.ma.array(image, mask=~valid), (160, 120))
+    rows, columns = np.nonzero(~valid)
+    distance = np.hypot(*(every[:, None, :2] - 0.5 - np.c_[columns, rows]).transpose(2, 0, 1)).min(1)
+    certain = np.abs(distance - 2 * every[:, 2]) > 1  # the distance is between pixel centres
+    kept = np.isin(of_every.view("V128").ravel(), descriptors.view("V128").ravel())
+    np.testing.assert_array_equal(kept[certain], (distance > 2 * every[:, 2])[certain])
+    assert len(px) == len(descriptors) == kept.sum() and 0.2 < kept.mean() < 0.8
+
+
 def test_the_strongest_features_are_kept(monkeypatch):
     rng = np.random.default_rng(0)
     image = cv2.GaussianBlur(rng.integers(0, 256, (120, 160)).astype(np.uint8), (0, 0), 1.0)
