@@ -21,8 +21,8 @@ OPTIONS += ["-m", TESTS]
 #: A mutant may take this many times the CPU time that its tests take without it, and this much more.
 SLOWER, MORE_S = 4.0, 30.0
 SURVIVED, KILLED, TIMED_OUT = "survived", "killed", "timed out"
-#: What pytest's exit status means: all passed, some failed, a file could not be imported.
-ENDED = {0: SURVIVED, 1: KILLED, 2: KILLED}
+#: What pytest's exit status means: all passed, some failed, a test file or a conftest could not be imported.
+ENDED = {0: SURVIVED, 1: KILLED, 2: KILLED, 4: KILLED}
 
 
 @dataclass(frozen=True)

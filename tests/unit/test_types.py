@@ -1,6 +1,7 @@
 """Records shared by all layers: poses, reports of steps, verdicts of several images, depth elsewhere."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,17 @@ def test_a_rig_maps_points_of_the_left_camera_to_the_right_one():
     in_right = rig.T_right_from_left @ point
     np.testing.assert_allclose(E[:3, :3] @ in_right[:3] + E[:3, 3], point[:3])
     np.testing.assert_allclose(rig.T_right_from_left @ np.append(E[:3, 3], 1.0), [0, 0, 0, 1], atol=1e-15)
+
+
+def test_resizing_a_rectified_rig_resizes_the_cameras_before_rectification():
+    rig, taken = (made_rig(K_LEFT, K, E, ((64, 48), (64, 48))) for K in (K_LEFT, K_LEFT + np.eye(3)))
+    rig = replace(rig, as_taken=taken.sized(None, None))
+    found = rig.resized((32, 24), (128, 96))
+    for each, before in ((found, rig), (found.as_taken, taken)):
+        assert (each.size_left, each.size_right) == ((32, 24), (128, 96))
+        np.testing.assert_array_equal(each.K_left, before.left.resized((32, 24)).K)
+        np.testing.assert_array_equal(each.K_right, before.right.resized((128, 96)).K)
+    assert rig.resized((64, 48), (64, 48)) is rig
 
 
 def test_a_step_report_keeps_every_value_on_its_way_to_the_cpu():

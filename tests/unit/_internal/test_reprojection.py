@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import InputError, MetricDepthOutput
 from geodiff_plugin._internal import strips as _strips
-from geodiff_plugin._internal.reprojection import _samples_per_side, depth_in_camera
+from geodiff_plugin._internal.reprojection import _above_surface, _samples_per_side, depth_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
 
 K = np.array([[120.0, 0.5, 79.0], [0, 125.0, 58.0], [0, 0, 1]])
@@ -255,3 +255,18 @@ def test_the_nearest_part_of_a_surface_has_no_holes_though_most_of_it_is_far():
     found = depth_in_camera(depth, Camera(square), target(square, pose(at=(0, 0, 1.5)), (100, 40)))
     near = found[:, 60:]  # columns from 80.5 on of the first camera
     np.testing.assert_allclose(near, 0.5, rtol=1e-4)
+
+
+def test_the_surface_is_known_inside_the_outermost_pixels():
+    """Inverse depth is interpolated between the four pixels around a point, also in the last row and column."""
+    v, u = np.mgrid[:9, :12]
+    inverse = 0.5 + 0.01 * u + 0.02 * v + 0.001 * u * v
+    camera = Camera(np.array([[10.0, 0, 5.5], [0, 10, 4], [0, 0, 1]]))
+    x, y = np.random.default_rng(0).uniform((-1, -1), (12, 9), (2000, 2)).T
+    x[:4], y[:4] = (0, 10.999, 5, 6.5), (3, 2.5, 0, 7.999)
+    points = np.c_[(x - 5.5) / 10, (y - 4) / 10, np.ones(len(x))] * 1.7
+    found = _above_surface(points, inverse, camera)
+    inside = (x >= 0) & (y >= 0) & (x < 11) & (y < 8)
+    expected = 1 / (0.5 + 0.01 * x + 0.02 * y + 0.001 * x * y) - 1.7
+    np.testing.assert_allclose(found[inside], expected[inside], rtol=1e-9)
+    assert np.isinf(found[~inside]).all() and 0.5 < inside.mean() < 0.9

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin.formats import read_calibration
+from geodiff_plugin.formats.quest import _camera
 from tests.contracts.calibrations import RIG, quest
 
 PAGE = Path(__file__).parents[3] / "docs/tutorials/first-rig.md"
@@ -50,3 +51,17 @@ def test_the_recipe_writes_pairs_that_were_taken_together(tmp_path):
     for order in (files, files[::-1]):  # the files name their side
         rig = read_calibration(order)
         np.testing.assert_allclose(rig.T_right_from_left, RIG.T, atol=1e-9)
+
+
+def test_the_image_is_a_centred_crop_of_the_sensor_resized():
+    """As PassthroughCameraAccess computes it: half the width, and the middle three quarters of the height."""
+    entries = {
+        "resolution": {"width": 640, "height": 480},
+        "sensorResolution": {"width": 1280, "height": 1280},
+        "focalLength": {"x": 900.0, "y": 910.0},
+        "principalPoint": {"x": 650.0, "y": 630.0},
+    }
+    camera = _camera(entries)
+    expected = [[450, 0, 324.5], [0, 455, 480 - (630 - 160) / 2 - 0.5], [0, 0, 1]]
+    np.testing.assert_allclose(camera.K, expected)
+    assert camera.size == (640, 480)

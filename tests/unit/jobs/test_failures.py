@@ -73,6 +73,14 @@ def test_words_of_an_item_are_no_part_of_its_cause():
     assert len(reported) == 2, "another cause: its picture is no word of it"
 
 
+def test_longer_words_are_left_out_before_the_shorter_ones_in_them():
+    found, reported = failures()
+    found.passed()
+    found.add(Item("1", words=("z", "az")), InputError("az is torn"))
+    found.add(Item("2", words=("z", "bz")), InputError("bz is torn"))
+    assert len(reported) == 1
+
+
 def test_a_bug_is_reported_with_its_traceback_and_type():
     found, reported = failures()
     assert found.add(Item("a"), KeyError("x")) == "KeyError: 'x'"

@@ -205,7 +205,7 @@ def test_an_end_in_a_hole_has_no_length(capture, tmp_path):
     ],
 )
 def test_lengths_that_a_capture_cannot_have_are_rejected(capture, typed):
-    with pytest.raises(InputError, match="--known-length|--distance|--measure|a frame"):
+    with pytest.raises(InputError, match=r"\A(--known-length|--distance|--measure|a frame)"):
         check_lengths(capture, options(**typed))
 
 
