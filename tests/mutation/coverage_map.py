@@ -76,9 +76,9 @@ class CoverageMap:
     def covering(self, module: str, lines: Masks) -> list[RecordedTest]:
         """The tests that execute one of these lines, and the module's own; the most specific ones first.
 
-        What runs when a module or a test file is imported counts for no test, or for the first one that imports
-        it. Tests in files named after the module are therefore always included, and if no test executes the
-        lines, those that execute anything else of the module.
+        What runs when a module or a test file is imported counts for no test, or for the first one that
+        imports it. Tests in files named after the module are therefore always included, and if no test
+        executes the lines, those that execute anything else of the module.
         """
         own = f"/test_{Path(module).stem}.py::"
         found = [

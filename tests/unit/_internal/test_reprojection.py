@@ -258,7 +258,7 @@ def test_the_nearest_part_of_a_surface_has_no_holes_though_most_of_it_is_far():
 
 
 def test_the_surface_is_known_inside_the_outermost_pixels():
-    """Inverse depth is interpolated between the four pixels around a point, also in the last row and column."""
+    """Inverse depth is interpolated between four pixels, also next to the last row and column."""
     v, u = np.mgrid[:9, :12]
     inverse = 0.5 + 0.01 * u + 0.02 * v + 0.001 * u * v
     camera = Camera(np.array([[10.0, 0, 5.5], [0, 10, 4], [0, 0, 1]]))
