@@ -21,8 +21,8 @@ Map = np.ndarray
 #: Minimum ground truth that counts and minimum value of a prediction, metres (Marigold's evaluation of
 #: KITTI).
 FLOOR_M = 1e-5
-#: Minimum aligned disparity, 1/m, before inversion: nothing is farther than a kilometre.
-MIN_DISPARITY = 1e-3
+#: Maximum aligned depth, metres, of predictions that decrease with depth.
+FARTHEST_M = 1000.0
 #: Maximum ratio of an inlier in the Robust Multi-View Depth Benchmark.
 INLIER = 1.03
 #: Metrics of depths ``(p, t)`` in metres, over pixels with both. Deltas are fractions of max(p/t, t/p) below
@@ -199,12 +199,12 @@ def to_space(depth_m: Map, space: str) -> Map:
 def align(values: Map, ground_truth_m: Map, valid: Map, space: str = "depth") -> Map:
     """Align ``values``, correct up to scale and shift in a space of ``SPACES``, to depth ``(H, W)`` metres.
 
-    Clipped to at least ``FLOOR_M`` and, if values decrease with depth, at most a kilometre; not finite where
-    ``values`` is not, and everywhere if no pixel has ground truth and prediction. Source: Marigold's
-    evaluation, ``least_square`` and ``least_square_disparity``, the latter over positive predictions only.
+    The result is at least ``FLOOR_M``, and at most ``FARTHEST_M`` if values decrease with depth. It is NaN
+    where ``values`` is not finite, and everywhere if no pixel has ground truth and prediction. Source:
+    Marigold's evaluation, ``least_square`` and ``least_square_disparity``, the latter over positive
+    predictions only.
     """
     kind = SPACES[check_choice(space, "space", SPACES)]
-    metre = torch.ones((), dtype=torch.float64)
     known = valid & np.isfinite(values) & (ground_truth_m > 0)
     if space == "disparity":
         known &= np.nan_to_num(values) > 0
@@ -216,8 +216,9 @@ def align(values: Map, ground_truth_m: Map, valid: Map, space: str = "depth") ->
     scale, shift = np.linalg.lstsq(pairs, target, rcond=None)[0]
     x = torch.from_numpy(values * scale + shift)
     if not kind.grows_with_depth:
-        x = x.clamp_min(float(kind.inverse(metre / MIN_DISPARITY)))
-    return np.maximum(kind.forward(x, metre).numpy(), FLOOR_M)
+        x = x.clamp_min(float(to_space(np.array(FARTHEST_M), space)))
+    depth_m = kind.forward(x, torch.ones((), dtype=torch.float64)).numpy()  # for a global scale of 1
+    return np.where(np.isfinite(values), np.maximum(depth_m, FLOOR_M), np.nan)
 
 
 #: Minimum ground-truth disparity step between neighbours that makes an edge, pixels.

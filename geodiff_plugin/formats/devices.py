@@ -110,11 +110,13 @@ def _rs_printed(text: str, choice: CameraChoice) -> _Pair:
         pairs = (line.partition(":") for line in block.splitlines())
         values: Entries = {key.strip().lower(): value.strip() for key, _, value in pairs}
         values |= {"coeffs": NUMBER.findall(values.get("coeffs", "")), "model": values.get("distortion")}
-        cameras[side].setdefault((int(values["width"]), int(values["height"])), _rs_camera(values))
-    left, right = (of_size(cameras[side], choice) for side in "12")
-    between = [*RS_EXTRINSIC.findall(text), ""][0]
-    rotation, translation = (NUMBER.findall(part) for part in between.partition("Translation")[::2])
-    return _Pair(left, right, transform(rotation[:9], translation[:3], "the extrinsics"))
+        size = int(values["width"]), int(values["height"])
+        cameras[side].setdefault(size, _rs_camera(values))  # a size is listed once for every pixel format
+    left, right = (of_size(cameras[side], choice) for side in ("1", "2"))
+    extrinsics = RS_EXTRINSIC.search(text)
+    rotation, _, translation = (extrinsics[1] if extrinsics else "").partition("Translation")
+    T = transform(NUMBER.findall(rotation)[:9], NUMBER.findall(translation)[:3], "the extrinsics")
+    return _Pair(left, right, T)
 
 
 def _rs_json(text: str) -> _Pair:

@@ -212,7 +212,7 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
     except Exception as error:  # any error that a damaged bag may cause
         reason = str(error).partition("\n")[0] or type(error).__name__
         bad_value("LEFT", "a whole bag", f"{path} ({reason})", "It may be truncated.")
-    pairs = _simultaneous(*stamps, tolerance_s)
+    pairs = _simultaneous(stamps[0], stamps[1], tolerance_s)
     if not pairs:
         got = f"{len(stamps[0])} and {len(stamps[1])} images, none within {tolerance_s:g} s of each other"
         bad_value(

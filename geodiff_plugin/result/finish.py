@@ -288,29 +288,27 @@ def refine(
     matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
     if not config.refine_edges or (matches is None and points is None):
         return None
-    weight = _mean(members, "match_weight")
-    error = _error_of(members)
-    spacing = max(image_size(depth_m)) / max(image_size(members[0].relative))
-    denoised_m = depth_m
-    depth_m = sharpen_edges(depth_m, left_01, max(1, round(spacing)))
-    target = fit_target(matches, points, weight, error, depth_m)
+    weight, error = _mean(members, "match_weight"), _error_of(members)
+    pixels_per_cell = max(image_size(depth_m)) / max(image_size(members[0].relative))
+    sharp_m = sharpen_edges(depth_m, left_01, max(1, round(pixels_per_cell)))
+    target = fit_target(matches, points, weight, error, sharp_m)
     if target is None or error is None:
         return None
-    strips = None if matches is None else _half_occlusions_on(evidence, target.size)
-    if strips is not None:
-        target = with_occluded(target, strips)
-    fit = fit_depth(depth_m, target, evidence.native.left.image_01[None], error, config)
-    fitted_m, support = fit.depth_m, fit.support
-    if matches is not None:
-        measured = error.amin((2, 3), keepdim=True)  # value where the prior gives a depth
-        target = fit_target(matches, points, weight, error, fitted_m)
-        assert target is not None  # there are matches
-        completed = target if strips is None else with_occluded(target, strips)
-        known = known_fraction(completed)
-        fitted_m = filter_depth(fitted_m, evidence, completed, known, measured, spacing)
-        fitted_m = flatten(fitted_m, completed, left_01, measured, denoised_m)
-        support = fit.support * data_support(known, image_size(fit.support))
-    return Refined(fitted_m, support, features_of(denoised_m, fitted_m, target, fit.support))
+    occlusions = None if matches is None else _half_occlusions_on(evidence, target.size)
+    completed = target if occlusions is None else with_occluded(target, occlusions)
+    fit = fit_depth(sharp_m, completed, evidence.native.left.image_01[None], error, config)
+    if matches is None:
+        return Refined(fit.depth_m, fit.support, features_of(depth_m, fit.depth_m, completed, fit.support))
+    # Selected again, because the fit has moved the edges next to which matches are left out.
+    target = fit_target(matches, points, weight, error, fit.depth_m)
+    assert target is not None  # there are matches
+    completed = target if occlusions is None else with_occluded(target, occlusions)
+    known = known_fraction(completed)
+    of_prior = error.amin((2, 3), keepdim=True)  # value where the prior gives a depth
+    filtered_m = filter_depth(fit.depth_m, evidence, completed, known, of_prior, pixels_per_cell)
+    flat_m = flatten(filtered_m, completed, left_01, of_prior, depth_m)
+    support = fit.support * data_support(known, image_size(fit.support))
+    return Refined(flat_m, support, features_of(depth_m, flat_m, target, fit.support))
 
 
 def _half_occlusions_on(evidence: Evidence, size: tuple[int, int]) -> HalfOcclusions | None:

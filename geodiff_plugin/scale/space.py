@@ -44,6 +44,12 @@ def smooth_floor(x: Tensor) -> Tensor:
     return torch.where(x > 0, 0.5 * (x + root), 2.0 * FLOOR_EPS * FLOOR_EPS / (root - x.clamp_max(0.0)))
 
 
+def inverse_smooth_floor(y: Tensor) -> Tensor:
+    """Return the value whose ``smooth_floor`` is ``y``; at least ``-1.5 FLOOR_EPS``, also for lower ``y``."""
+    y = y.clamp_min(0.5 * FLOOR_EPS)
+    return y - FLOOR_EPS**2 / y
+
+
 def inverse_softplus(y: Tensor) -> Tensor:
     """Return the raw value whose softplus is ``y``; ``y > 0``, any shape."""
     return y + torch.log(-torch.expm1(-y))
@@ -177,13 +183,12 @@ class MetricMap:
 
     @has_kernel("scale.kernels.space.relative", when=_has_form)
     def relative(self, depth_m: Tensor, affine: AffineState) -> Tensor:
-        """Convert metric depth ``(B, 1, H, W)`` to the relative map; inverse of the call, bounded below 0."""
+        """Convert metric depth ``(B, 1, H, W)`` to the relative map; inverse of the call."""
         s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
         floored = (SPACES[self.space].inverse(depth_m / g) - t) / s
         if self.positive == SQUARE:
             return self.confine(floored)
-        floored = floored.clamp_min(0.5 * FLOOR_EPS)
-        return floored - FLOOR_EPS**2 / floored
+        return inverse_smooth_floor(floored)
 
     def from_range(self, near_m: Tensor, far_m: Tensor) -> AffineState:
         """Return the affine state for which the ends of a map have the given depths, ``(B,)`` metres."""

@@ -33,6 +33,8 @@ MIN_SHIFT_PX = 3
 #: both images of 73 correct pairs, also flipped, transposed, halved and blurred, had 1.12 for this and for
 #: ``GAIN``. Of images with a shifted third, 25 of 25 had a row with 1.4 to 24.
 STEEP = 1.3
+#: Difference between rows, in grey levels, below which nearby rows count as this different.
+MIN_DIFFERENCE = 0.5
 #: Minimum factor by which the shift reduces the difference between the rows.
 GAIN = 1.3
 #: Number of segments of a row that are compared separately.
@@ -102,10 +104,10 @@ def _tears(grey: np.ndarray) -> list[_TornRow]:
     """Find the tears of a grey image ``(H, W)`` uint8, the clearest first."""
     if len(grey) < 2 * EDGE + 2:
         return []
-    rows = _sums(cv2.absdiff(grey[1:], grey[:-1])) / np.float32(grey.shape[1])  # (H - 1,), row to row
-    near = np.pad(rows, 3, mode="edge")
-    near = np.stack([near[k : k + len(rows)] for k in (0, 1, 5, 6)]).max(0)  # two and three rows away
-    steep = rows / np.maximum(near, 0.5)
+    difference = _sums(cv2.absdiff(grey[1:], grey[:-1])) / np.float32(grey.shape[1])  # (H - 1,), row to row
+    padded = np.pad(difference, 3, mode="edge")
+    rows_away = [padded[3 + k : 3 + k + len(difference)] for k in (-3, -2, 2, 3)]
+    steep = difference / np.maximum(np.max(rows_away, axis=0), MIN_DIFFERENCE)
     steep[:EDGE], steep[-EDGE:] = 0, 0
     found = []
     for row in np.argsort(-steep)[:MAX_ROWS]:

@@ -42,8 +42,13 @@ FROM_COARSER = tl.constexpr(2)
 NO_ERROR = tl.constexpr(0)
 PER_SAMPLE = tl.constexpr(1)
 PER_PIXEL = tl.constexpr(2)
-#: Number of work arrays of a field's size.
+#: Number of work arrays of a field's size, and the places of those after the residual. The directions of even
+#: and odd steps are next to each other.
 WORK_ARRAYS = tl.constexpr(6)
+PRECONDITIONED = tl.constexpr(1)
+PRODUCT = tl.constexpr(2)
+INVERSE_DIAGONAL = tl.constexpr(3)
+DIRECTIONS = tl.constexpr(4)
 #: Number of partial sums per tile.
 SUMS = tl.constexpr(3)
 #: Number of partial sums added per iteration.
@@ -268,8 +273,8 @@ def _residual_tile(system, rhs, x, work, now, p, n, width, stride, area):
     rest += to_upper * _value_at(x, p - width, n)
     rest += to_lower * _value_at(x, p + width, n)
     tl.store(work + p, rest, inside)
-    tl.store(work + area + p, rest / diagonal, inside)
-    tl.store(work + 3 * area + p, 1.0 / diagonal, inside)
+    tl.store(work + PRECONDITIONED * area + p, rest / diagonal, inside)
+    tl.store(work + INVERSE_DIAGONAL * area + p, 1.0 / diagonal, inside)
     tl.store(now, tl.sum(tl.where(inside, rest * rest / diagonal, 0.0), 0))
 
 
@@ -277,38 +282,39 @@ def _residual_tile(system, rhs, x, work, now, p, n, width, stride, area):
 def _parts_of_direction(work, area, p, n, step):
     """Load the terms of the new direction at pixels: preconditioned residual and previous direction."""
     inside = (p >= 0) & (p < n)
-    here = tl.load(work + area + p, inside, 0.0, cache_modifier=".cg")
-    old = work + (5 - step % 2) * area
-    return here, tl.load(old + p, inside & (step > 0), 0.0, cache_modifier=".cg")
+    z = tl.load(work + PRECONDITIONED * area + p, inside, 0.0, cache_modifier=".cg")
+    before = work + (DIRECTIONS + (step + 1) % 2) * area
+    return z, tl.load(before + p, inside & (step > 0), 0.0, cache_modifier=".cg")
 
 
 @triton.jit
 def _direction_tile(system, work, partial, step, tile, tiles, count, p, n, width, stride, area):
-    """Compute the direction of a step in a tile, its product with the matrix, and the partial dot product.
+    """Compute the direction ``d = z + beta d_before`` of a step in a tile, ``A d`` and partial ``d . A d``.
 
-    All pixels are loaded before the sums: a sum synchronizes the threads, and loads after it would stall
-    again.
+    ``z`` is the preconditioned residual. The neighbours' ``d`` is computed again here, so that programs need
+    not synchronize between ``d`` and ``A d``. All pixels are loaded before the sums: a sum synchronizes the
+    threads, and loads after it would stall again.
     """
     inside = p < n
     diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(system, p, n, width, stride)
     # Other programs still read the previous direction while the new one is written.
-    here, before = _parts_of_direction(work, area, p, n, step)
-    left, left_before = _parts_of_direction(work, area, p - 1, n, step)
-    right, right_before = _parts_of_direction(work, area, p + 1, n, step)
-    upper, upper_before = _parts_of_direction(work, area, p - width, n, step)
-    lower, lower_before = _parts_of_direction(work, area, p + width, n, step)
-    fraction = _total(partial + (step % 2) * count, tiles)
-    fraction /= tl.maximum(_total(partial + ((step + 1) % 2) * count, tiles), TINY)
-    fraction = tl.where(step > 0, fraction, 0.0)  # the first step has no previous direction
-    here += fraction * before
-    value = diagonal * here
-    value -= to_left * (left + fraction * left_before)
-    value -= to_right * (right + fraction * right_before)
-    value -= to_upper * (upper + fraction * upper_before)
-    value -= to_lower * (lower + fraction * lower_before)
-    tl.store(work + (4 + step % 2) * area + p, here, inside)
-    tl.store(work + 2 * area + p, value, inside)
-    tl.store(partial + 2 * count + tile, tl.sum(tl.where(inside, here * value, 0.0), 0))
+    z, before = _parts_of_direction(work, area, p, n, step)
+    z_left, before_left = _parts_of_direction(work, area, p - 1, n, step)
+    z_right, before_right = _parts_of_direction(work, area, p + 1, n, step)
+    z_upper, before_upper = _parts_of_direction(work, area, p - width, n, step)
+    z_lower, before_lower = _parts_of_direction(work, area, p + width, n, step)
+    beta = _total(partial + (step % 2) * count, tiles)
+    beta /= tl.maximum(_total(partial + ((step + 1) % 2) * count, tiles), TINY)
+    beta = tl.where(step > 0, beta, 0.0)  # the first step has no previous direction
+    direction = z + beta * before
+    product = diagonal * direction
+    product -= to_left * (z_left + beta * before_left)
+    product -= to_right * (z_right + beta * before_right)
+    product -= to_upper * (z_upper + beta * before_upper)
+    product -= to_lower * (z_lower + beta * before_lower)
+    tl.store(work + (DIRECTIONS + step % 2) * area + p, direction, inside)
+    tl.store(work + PRODUCT * area + p, product, inside)
+    tl.store(partial + 2 * count + tile, tl.sum(tl.where(inside, direction * product, 0.0), 0))
 
 
 @triton.jit
@@ -318,17 +324,19 @@ def _update_tile(x, work, partial, step, tile, tiles, count, p, n, area):
     Pixels are loaded before the sums, as in ``_direction_tile``.
     """
     inside = p < n
-    iterate, direction = _value_at(x, p, n), _value_at(work + (4 + step % 2) * area, p, n)
-    rest, image = _value_at(work, p, n), _value_at(work + 2 * area, p, n)
-    inverse = _value_at(work + 3 * area, p, n)
+    iterate = _value_at(x, p, n)
+    direction = _value_at(work + (DIRECTIONS + step % 2) * area, p, n)
+    rest = _value_at(work, p, n)
+    product = _value_at(work + PRODUCT * area, p, n)
+    inverse = _value_at(work + INVERSE_DIAGONAL * area, p, n)
     length = _total(partial + (step % 2) * count, tiles)
     length /= tl.maximum(_total(partial + 2 * count, tiles), TINY)
     iterate += length * direction
     tl.store(x + p, iterate, inside)
-    rest -= length * image
+    rest -= length * product
     z = rest * inverse
     tl.store(work + p, rest, inside)
-    tl.store(work + area + p, z, inside)
+    tl.store(work + PRECONDITIONED * area + p, z, inside)
     tl.store(partial + ((step + 1) % 2) * count + tile, tl.sum(tl.where(inside, rest * z, 0.0), 0))
 
 

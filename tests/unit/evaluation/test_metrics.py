@@ -117,7 +117,7 @@ def test_alignment_clips_what_lies_behind_the_camera_or_too_far_and_keeps_holes(
     aligned = metrics.align(
         values, ground_truth, ground_truth > 0, "disparity"
     )  # the last is no part of the fit
-    np.testing.assert_allclose(aligned, [[1.0, 2.0, 1 / metrics.MIN_DISPARITY]])
+    np.testing.assert_allclose(aligned, [[1.0, 2.0, metrics.FARTHEST_M]])
     behind = metrics.align(np.array([[1.0, 2.0, -4.0]]), ground_truth, np.array([[True, True, False]]))
     assert behind[0, 2] == metrics.FLOOR_M
     for space, hole in (("depth", NAN), ("disparity", 0.0)):
@@ -230,3 +230,13 @@ def test_inliers_are_within_three_per_cent_either_way():
     pred = ground_truth * [[1.0, 1.029, 1.031, 1 / 1.029, 1 / 1.031, 0]]
     scores = metrics.evaluate_depth(pred, ground_truth, ground_truth > 0)
     assert scores["inliers"] == pytest.approx(3 / 5)
+
+
+def test_values_that_are_not_finite_stay_holes():
+    truth = np.linspace(1.0, 4.0, 24).reshape(4, 6)
+    for space in metrics.SPACES:
+        values = metrics.to_space(truth, space)
+        values[0, :3] = np.nan, np.inf, -np.inf
+        aligned = metrics.align(values, truth, np.ones(truth.shape, bool), space)
+        assert np.isnan(aligned[0, :3]).all()
+        np.testing.assert_allclose(aligned[1:], truth[1:], rtol=1e-6)
