@@ -50,7 +50,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("scan", nargs="?", type=Path, help="a capture (default: a rendered scene)")
     parser.add_argument("--frames", default="2:2", help="NAME,NAME or FIRST:LAST:STEP")
     parser.add_argument("--size", type=int, nargs=2, default=(192, 256), metavar=("H", "W"), help="pixels")
-    parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
+    parser.add_argument("--prior", default="bundled", help="'bundled', a Hugging Face model ID or a folder")
     parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     options = parser.parse_args(argv)
 

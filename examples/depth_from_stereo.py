@@ -27,7 +27,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("left", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "left.png")
     parser.add_argument("right", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "right.png")
     parser.add_argument("calib", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "calib.txt")
-    parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
+    parser.add_argument("--prior", default="bundled", help="'bundled', a Hugging Face model ID or a folder")
     parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     parser.add_argument(
         "--out", type=Path, default=Path("depth_from_stereo"), help="output path without suffix"

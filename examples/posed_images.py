@@ -38,7 +38,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=8, help="seed of the scene")
     parser.add_argument("--angle", type=float, default=8.0, help="rotation of the right camera in degrees")
     parser.add_argument("--size", type=int, nargs=2, default=(192, 256), metavar=("H", "W"), help="pixels")
-    parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
+    parser.add_argument("--prior", default="bundled", help="'bundled', a Hugging Face model ID or a folder")
     parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     options = parser.parse_args(argv)
 

@@ -56,7 +56,7 @@ def main(argv: list[str] | None = None) -> None:
         help="two videos and a calibration (default: rendered)",
     )
     parser.add_argument("--frames", type=int, default=4, help="maximum number of frames, from the first")
-    parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
+    parser.add_argument("--prior", default="bundled", help="'bundled', a Hugging Face model ID or a folder")
     parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     parser.add_argument("--out", type=Path, default=Path("rig_video.webp"), help=".webp, .gif or .mp4")
     options = parser.parse_args(argv)

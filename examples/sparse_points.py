@@ -32,7 +32,7 @@ def main(argv: list[str] | None = None) -> None:
         metavar="IMAGE POINTS K",
         help="image, points and K (default: rendered)",
     )
-    parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
+    parser.add_argument("--prior", default="bundled", help="'bundled', a Hugging Face model ID or a folder")
     parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     parser.add_argument("--out", type=Path, default=Path("sparse_points.npy"), help="depth, metres")
     options = parser.parse_args(argv)

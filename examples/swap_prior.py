@@ -32,7 +32,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("left", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "left.png")
     parser.add_argument("right", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "right.png")
     parser.add_argument("calib", type=Path, nargs="?", default=DEMO_PAIR_FOLDER / "calib.txt")
-    parser.add_argument("--prior", action="append", help="'bundled', a hub id or a folder; may be repeated")
+    parser.add_argument(
+        "--prior", action="append", help="'bundled', a Hugging Face model ID or a folder; may be repeated"
+    )
     parser.add_argument("--out", type=Path, default=Path("swap_prior.png"), help="output image")
     options = parser.parse_args(argv)
 

@@ -34,7 +34,7 @@ def main(argv: list[str] | None = None) -> None:
     )
     parser.add_argument("--baseline", type=float, help="distance between the cameras in metres")
     parser.add_argument("--fov", type=float, help="horizontal field of view in degrees (default: from EXIF)")
-    parser.add_argument("--prior", default="bundled", help="'bundled', a hub id or a folder")
+    parser.add_argument("--prior", default="bundled", help="'bundled', a Hugging Face model ID or a folder")
     parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
     parser.add_argument("--out", type=Path, default=Path("unposed_images.npy"), help="depth, metres")
     options = parser.parse_args(argv)

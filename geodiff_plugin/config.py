@@ -31,7 +31,7 @@ class _FrozenDict(dict[str, Any]):
     """An immutable dict that compares equal to a dict with the same items."""
 
     def _forbid(self, *_: Any, **__: Any) -> Any:
-        raise TypeError("a configuration is immutable; create another one with changed(...)")
+        raise TypeError("a configuration is immutable; create a new one with changed(...)")
 
     __setitem__ = __delitem__ = __ior__ = clear = pop = popitem = setdefault = update = _forbid
 
@@ -152,7 +152,7 @@ class GuidanceConfig:
     decoder: str = _call(
         "full",
         "Autoencoder for latents ([priors](../reference/priors.md))",
-        **_text("`full`, `tiny`, a folder or a hub id"),
+        **_text("`full`, `tiny`, a folder or a Hugging Face model ID"),
         paper="-",
     )
     ssim_weight: float = _term(

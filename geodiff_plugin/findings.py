@@ -25,7 +25,7 @@ class Severity(Enum):
     REASON = "reason"  # the result is not trusted
     REMARK = "remark"  # unusual, but possibly correct
     ASSUMPTION = "assumption"  # the result is correct if the assumption holds
-    WARNING = "warning"  # how the input was handled
+    WARNING = "warning"  # other information about the input, its handling, or the output
 
 
 REASON, REMARK = Severity.REASON, Severity.REMARK
@@ -155,42 +155,43 @@ _KINDS = (
     FindingKind(
         "image.bits",
         WARNING,
-        "16-bit images of a bag are interpreted as 10, 12 or 14 bits",
+        "The 16-bit images in a bag are treated as 10-, 12- or 14-bit images",
         cause="The camera records 10, 12 or 14 bits, and its driver stores the values without scaling.",
-        hint="Ignore the warning, unless the camera records 16 bits and the scene was dark.",
+        hint="Ignore this warning unless the camera records 16 bits and the scene was dark; the images then "
+        "appear too bright.",
     ),
     FindingKind(
         "image.alpha",
         WARNING,
-        "Pixels with alpha 0 are not valid",
+        "Fully transparent pixels (alpha 0) are treated as invalid",
         cause="The image has four channels.",
-        hint="Remove the alpha channel if transparent pixels show the scene.",
+        hint="Remove the alpha channel if those pixels contain scene content.",
     ),
     FindingKind(
         "image.rotated",
         WARNING,
         "The image was rotated according to its EXIF orientation",
-        cause="The camera stored the image in another orientation and recorded that in EXIF.",
-        hint="Give the K of the upright image.",
+        cause="The camera stored the image in a different orientation and recorded it in EXIF.",
+        hint="Pass K for the upright image.",
     ),
     FindingKind(
         "image.orientation",
         WARNING,
         "The EXIF orientation is not applied",
         cause="In-memory images are used as is.",
-        hint="Call PIL.ImageOps.exif_transpose first, and give the K of the upright image.",
+        hint="Call PIL.ImageOps.exif_transpose first, and pass K for the upright image.",
     ),
     FindingKind(
         "camera.from-exif",
         ASSUMPTION,
         "K is estimated from the EXIF focal length",
-        cause="Neither K nor a field of view was given.",
+        cause="Neither K nor a field of view was specified.",
         hint="Ignore this if an error of a few percent is acceptable; otherwise calibrate the camera.",
     ),
     FindingKind(
         "camera.from-list",
         ASSUMPTION,
-        "The focal length is a manufacturer's value for a camera chosen in the web app",
+        "The focal length is the manufacturer's value for the camera selected in the web app",
         cause="The image files have no EXIF focal length.",
         hint="Use images with EXIF data, or calibrate the camera.",
     ),
@@ -205,29 +206,29 @@ _KINDS = (
         "camera.assumed-intrinsics",
         ASSUMPTION,
         "Missing intrinsics are set to default values",
-        cause="Only a focal length was given.",
-        hint="Give the calibrated fy, cx and cy (--fy, --cx, --cy).",
+        cause="Only a focal length was specified.",
+        hint="Set the calibrated fy, cx and cy (--fy, --cx, --cy).",
     ),
     FindingKind(
         "camera.zoom",
         WARNING,
-        "The image was zoomed digitally",
+        "The image was taken with digital zoom",
         cause="Some cameras do not include a digital zoom in their EXIF focal length.",
-        hint="Take the image without zoom, or give K.",
+        hint="Retake the image without digital zoom, or provide K.",
     ),
     FindingKind(
         "camera.assumed-cx",
         ASSUMPTION,
         "The right camera's cx is assumed to equal the left camera's",
-        cause="Only one K was given for two parallel cameras.",
-        hint="Give the right camera's matrix (K_right, --K-right) or its cx (--cx-right).",
+        cause="Only one K was passed for two parallel cameras.",
+        hint="Pass the right camera's matrix (K_right, --K-right) or its cx (--cx-right).",
     ),
     FindingKind(
         "camera.principal-point",
         REASON,
         "The principal point is far from the image centre",
-        cause="K belongs to an image of another size.",
-        hint="Scale K with the image; for a cropped image set cropped=True (--cropped).",
+        cause="K is for a different image size.",
+        hint="Scale K to this image size. If the image is cropped, set cropped=True (--cropped).",
     ),
     FindingKind(
         "camera.aspect-ratio",
@@ -240,44 +241,45 @@ _KINDS = (
         "camera.focal-mismatch",
         WARNING,
         "The focal length in K contradicts the EXIF focal length",
-        cause="K belongs to an image of another size or to another lens.",
+        cause="K is for a different image size or a different lens.",
         hint="Check the image size that K was calibrated for, and scale K.",
     ),
     FindingKind(
         "calibration.no-unit",
         WARNING,
         "The calibration has no unit of length",
-        cause="Structure-from-motion models have an unknown scale.",
-        hint="Give the measured baseline (baseline_m, --baseline).",
+        cause="The scale of a structure-from-motion model is unknown.",
+        hint="Specify the measured baseline (baseline_m, --baseline).",
     ),
     FindingKind(
         "calibration.assumed-metres",
         REASON,
         "The calibration's unit is assumed to be metres",
-        cause="The file states no unit, and in metres its baseline would be longer than 1.5 m.",
-        hint="Give the measured baseline (baseline_m, --baseline), or add the unit to the name of the "
-        "translation in the file, such as translation_mm.",
+        cause="The file states no unit. If it is in metres, the baseline is longer than 1.5 m, which is "
+        "unusual.",
+        hint="Specify the measured baseline (baseline_m, --baseline), or rename the translation field in the "
+        "file to include its unit, for example translation_mm.",
     ),
     FindingKind(
         "calibration.unrectified",
         WARNING,
         "The images are treated as unrectified",
         cause="The calibration describes both raw and rectified images, and the matches fit raw images.",
-        hint="If the images are rectified, give a file that contains only P1 and P2.",
+        hint="If the images are rectified, pass a file that contains only P1 and P2.",
     ),
     FindingKind(
         "calibration.doffs",
         WARNING,
         "The right cx in a Middlebury file contradicts doffs",
         cause="cam1 is missing, or its cx differs from cx0 + doffs, on which the ground truth is based.",
-        hint="Ignore the warning if the file is the published one; otherwise correct doffs or cam1.",
+        hint="Ignore this warning if the file is the published one; otherwise correct doffs or cam1.",
     ),
     FindingKind(
         "calibration.assumed-lens",
         WARNING,
         "The focal length of SceneFlow images is assumed",
         cause="camera_data.txt has no intrinsics, and the folder name does not state the lens.",
-        hint="Ignore the warning if the lens is 35 mm. For Driving's 15 mm images, keep the folder name "
+        hint="Ignore this warning if the lens is 35 mm. For Driving's 15 mm images, keep the folder name "
         "15mm_focallength in the path.",
     ),
     FindingKind(
@@ -292,8 +294,8 @@ _KINDS = (
         REASON,
         "The baseline is longer than 20 m",
         cause="The translation is in millimetres.",
-        hint="Divide E[:3, 3], or the baseline, by 1000. If it is in metres, give the depth range of the "
-        "scene (depth_range, --near, --far).",
+        hint="Divide E[:3, 3], or the baseline, by 1000. If it really is in metres, set the depth range of "
+        "the scene to confirm it (depth_range, --near, --far).",
     ),
     FindingKind(
         "estimate.second-motion",
@@ -306,8 +308,8 @@ _KINDS = (
         "estimate.learned",
         ASSUMPTION,
         "The poses come from learned matches",
-        cause="SIFT found no pose, because the images are dark or blurred, or have little or repetitive "
-        "texture.",
+        cause="No pose could be estimated from SIFT features: the images are dark or blurred, or have little "
+        "or repetitive texture.",
         hint="Check the result, for example with a known length. Take brighter, sharper images.",
     ),
     FindingKind(
@@ -322,42 +324,42 @@ _KINDS = (
         WARNING,
         "Nearly all matches lie on one plane",
         cause="The images show a wall, a floor or a poster.",
-        hint="Include objects at different depths, or give the pose.",
+        hint="Include objects at different depths, or provide the pose.",
     ),
     FindingKind(
         "estimate.unconstrained",
         WARNING,
         "The matches do not constrain the estimated pose",
         cause="The images have little texture or a short baseline.",
-        hint="Take other images, or give the pose.",
+        hint="Take new images with more texture or a longer baseline, or provide the pose.",
     ),
     FindingKind(
         "scale.none",
         WARNING,
         "The scale is unknown",
         cause="Two images without a measured length have no metric scale.",
-        hint="Give the baseline, a known length, or known points.",
+        hint="Provide the baseline, a known length, or known points.",
     ),
     FindingKind(
         "scale.guessed",
         ASSUMPTION,
         "The distance between the cameras is a guess",
         cause="A rough distance was chosen in the web app.",
-        hint="Measure the distance, or give a known length.",
+        hint="Measure the distance, or provide a known length.",
     ),
     FindingKind(
         "scale.from-prior",
         ASSUMPTION,
         "The scale comes from the metric prior",
-        cause="No length was given, and the prior predicts metres.",
-        hint="Give a measured length to make the scale independent of the prior.",
+        cause="No length was specified, and the prior predicts metres.",
+        hint="Provide a measured length to make the scale independent of the prior.",
     ),
     FindingKind(
         "points.far",
         REASON,
         "The known depths look like millimetres",
-        cause="All of them are far away, or they are large integers.",
-        hint="Divide them by 1000, or give their scale (scale=1000, --points-scale 1000).",
+        cause="All of them are very large, or are large integers.",
+        hint="Divide them by 1000, or set their scale (scale=1000, --points-scale 1000).",
     ),
     FindingKind(
         "prior.one-member",
@@ -371,21 +373,21 @@ _KINDS = (
         WARNING,
         "Frames are skipped",
         cause="A frame has no image file, no pose, or an unsupported camera; the message states which.",
-        hint="Ignore the warning if enough frames remain.",
+        hint="Ignore this warning if enough frames remain.",
     ),
     FindingKind(
         "capture.part",
         WARNING,
         "Only part of the folder is read",
         cause="The folder has several models, splits or cameras, and one of them is used.",
-        hint="To use another one, give its file or folder.",
+        hint="To use a different one, pass its file or folder.",
     ),
     FindingKind(
         "capture.images-found",
         WARNING,
         "Images were found in a different folder from the one in the camera file",
         cause="The usual folders do not hold the images, but a nearby folder has files with the same names.",
-        hint="Check that they are the right images; if not, give their folder (--images).",
+        hint="Check that they are the correct images; if not, pass the correct folder (--images).",
     ),
     FindingKind(
         "capture.masks",
@@ -393,13 +395,13 @@ _KINDS = (
         "Masks found in the capture are used",
         cause="The camera file lists masks (mask_path), or a folder named masks is next to the images, as in "
         "COLMAP.",
-        hint="If the masks mark something else, such as one object, move their folder, or pass an all-white "
-        "mask (--mask) to ignore them.",
+        hint="If the masks serve another purpose, such as segmenting an object, move the folder, or pass an "
+        "all-white mask (--mask) to ignore them.",
     ),
     FindingKind(
         "image.overlays",
         WARNING,
-        "Part of the image is the same in every frame",
+        "Part of the image is the same in at least 40 % of the frames",
         cause="Text or a logo is burnt into the frames, or part of the rig is visible.",
         hint="These pixels get no depth. If they show the scene, pass an all-white mask (--mask) to keep "
         "them.",
@@ -409,14 +411,14 @@ _KINDS = (
         WARNING,
         "Masks listed in the camera file are missing",
         cause="The file has a mask_path for frames whose mask does not exist.",
-        hint="Restore the masks, or give their folder (--mask).",
+        hint="Restore the masks, or pass their folder (--mask).",
     ),
     FindingKind(
         "capture.unused-poses",
         WARNING,
         "Images are read without poses, although poses may exist",
         cause="The folder also has another program's camera file, or a folder that looks like a capture.",
-        hint="Give the file or folder that the message names, or convert it as the message describes.",
+        hint="Pass the file or folder that the message names, or convert it as the message describes.",
     ),
     FindingKind(
         "capture.no-poses",
@@ -429,45 +431,45 @@ _KINDS = (
         "capture.size-mismatch",
         REASON,
         "The image sizes differ slightly from the calibrated sizes",
-        cause="The images have not been undistorted, or come from another export.",
-        hint="Give the folder of the matching images (--images), or the reconstruction that these images "
+        cause="The images have not been undistorted, or come from a different export.",
+        hint="Pass the folder of the matching images (--images), or the reconstruction that these images "
         "belong to.",
     ),
     FindingKind(
         "capture.assumed-metres",
         WARNING,
         "The unit of a transforms.json is assumed to be metres",
-        cause="The file states no unit and has no depth maps. Devices that record depth maps use metres.",
-        hint="If the poses were estimated from images, or the scene was rendered in another unit, give a "
-        "length (--known-length, --distance, --metres-per-unit).",
+        cause="The file states no unit. It also has no sensor depth maps, which would imply metres.",
+        hint="If the poses were estimated from images, or the scene was rendered in a different unit, "
+        "specify a length (--known-length, --distance, --metres-per-unit).",
     ),
     FindingKind(
         "capture.gps-scale",
         WARNING,
         "The scale of the capture comes from GPS",
         cause="OpenSfM aligned the reconstruction with GPS positions, which are accurate to a few metres.",
-        hint="Give --metres-per-unit 1 to accept this scale, or give a measured length.",
+        hint="Pass --metres-per-unit 1 to accept this scale, or specify a measured length.",
     ),
     FindingKind(
         "capture.stored-pixels",
         WARNING,
         "The EXIF orientation of the frames is not applied",
         cause="The cameras of the capture refer to the pixels as stored in the image files.",
-        hint="No action is needed: the depth maps have the stored orientation, too.",
+        hint="No action is needed. The depth maps have the same orientation as the stored images.",
     ),
     FindingKind(
         "capture.assumed-k",
         WARNING,
         "K is the published value for the dataset",
         cause="7-Scenes and TUM RGB-D have no calibration file.",
-        hint="Give K (--K) if another camera was used.",
+        hint="Pass K (--K) if a different camera was used.",
     ),
     FindingKind(
         "capture.no-trajectory",
         WARNING,
         "The poses of the video are estimated without scale",
-        cause="No trajectory was given.",
-        hint="Give a trajectory (--trajectory), or a length (--known-length, --distance).",
+        cause="No trajectory was provided.",
+        hint="Pass a trajectory (--trajectory), or specify a length (--known-length, --distance).",
     ),
     FindingKind(
         "capture.trajectory-times",
@@ -482,7 +484,7 @@ _KINDS = (
         WARNING,
         "Some frames are blurred or textureless",
         cause="Few features were found in these frames.",
-        hint="Ignore the warning: no other frame depends on them. Move the camera more slowly next time.",
+        hint="Ignore this warning: no other frame depends on them. Move the camera more slowly next time.",
     ),
     FindingKind(
         "capture.no-matches",
@@ -496,28 +498,28 @@ _KINDS = (
         WARNING,
         "The poses are read in a different convention from the declared one",
         cause="The matches contradict the declared convention.",
-        hint="Check that the convention in the message is the right one.",
+        hint="Check that the convention in the message is the correct one.",
     ),
     FindingKind(
         "capture.unknown-convention",
         REASON,
         "The pose convention is unknown",
         cause="The matches fit no known convention; even the best one leaves large epipolar errors.",
-        hint="Give camera-to-world poses of these images, in OpenCV or OpenGL axes.",
+        hint="Provide camera-to-world poses of these images, in OpenCV or OpenGL axes.",
     ),
     FindingKind(
         "capture.rotated",
         REASON,
         "The images are rotated relative to their cameras",
-        cause="The images were rotated afterwards, or their stored orientation is not the one that the poses "
-        "and K assume.",
-        hint="Rotate the images as the message describes, or give poses and K of the images as stored.",
+        cause="The images were rotated after capture, or their stored orientation is not the one that the "
+        "poses and K assume.",
+        hint="Rotate the images as the message describes, or provide poses and K for the images as stored.",
     ),
     FindingKind(
         "capture.focal",
         WARNING,
         "The best-fitting focal length is far from the given one",
-        cause="K is for another image size, or the camera motion does not constrain the focal length.",
+        cause="K is for a different image size, or the camera motion does not constrain the focal length.",
         hint="Check K; the given focal length is used.",
     ),
     FindingKind(
@@ -530,16 +532,16 @@ _KINDS = (
     FindingKind(
         "capture.scales",
         WARNING,
-        "Camera positions and depth maps give different scales",
+        "Camera positions and depth maps imply different scales",
         cause="The tracked camera positions are inaccurate.",
-        hint="Give a known length (--known-length).",
+        hint="Specify a known length (--known-length).",
     ),
     FindingKind(
         "capture.scale",
         REASON,
         "The scale of the capture is uncertain",
         cause="The scale varies between frames, or the trajectory contradicts the depth of the scene.",
-        hint="Give a known length (--known-length) or a distance (--distance).",
+        hint="Specify a known length (--known-length) or a distance (--distance).",
     ),
     FindingKind(
         "capture.length",
@@ -547,7 +549,7 @@ _KINDS = (
         "The known length cannot be measured accurately in its frame",
         cause="An endpoint of --known-length has uncertain depth: it is textureless, on a depth edge, or "
         "seen by no other frame.",
-        hint="Choose other endpoints, or give a distance (--distance).",
+        hint="Choose different endpoints, or specify a distance (--distance).",
     ),
     FindingKind(
         "capture.wrong-poses",
@@ -561,7 +563,7 @@ _KINDS = (
         WARNING,
         "Some frames are not connected to the others",
         cause="They share too few points with other frames, or refinement made their fit worse.",
-        hint="Ignore the warning if enough frames remain; otherwise record with more overlap.",
+        hint="Ignore this warning if enough frames remain; otherwise record with more overlap.",
     ),
     FindingKind(
         "capture.components",
@@ -580,34 +582,34 @@ _KINDS = (
     FindingKind(
         "pairs.in-order",
         WARNING,
-        "The images of two folders are paired in order",
+        "The images of two folders are paired by position, not by name",
         cause="The folders have no file name in common.",
-        hint="Check the first and last pair in the message. If they are wrong, give both images of a pair "
-        "the same name.",
+        hint="Check the first and last pair in the message. If they are wrong, rename the images so that "
+        "both images of a pair have the same name.",
     ),
     FindingKind(
         "pairs.side-by-side",
         WARNING,
         "One image or video holds both views",
-        cause="--side-by-side was given without a layout, or only one video was given.",
-        hint="Give the layout if the inferred one is wrong, or pass both videos if this one contains only "
+        cause="--side-by-side was passed without a layout, or only one video was passed.",
+        hint="Specify the layout if the inferred one is wrong, or pass both videos if this one contains only "
         "the left view.",
     ),
     FindingKind(
         "pairs.layout",
         ASSUMPTION,
         "The layout of an image or video that holds both views is assumed",
-        cause="No layout was given, and the image's shape and content are inconclusive.",
-        hint="Give it (--side-by-side full, half, over-under or half-over-under). A wrong one may scale the "
-        "depth by 2 or 0.5.",
+        cause="No layout was specified, and the image's shape and content are inconclusive.",
+        hint="Specify it (--side-by-side full, half, over-under or half-over-under). A wrong layout can make "
+        "all depths wrong by a factor of 2.",
     ),
     FindingKind(
         "pairs.offset",
         ASSUMPTION,
         "The time between the starts of two videos is estimated",
         cause="The videos have different lengths, or their brightness changes at different times.",
-        hint="Give the start time of RIGHT relative to LEFT, in seconds (--offset; positive if RIGHT started "
-        "later), or trim both videos to the same time span.",
+        hint="Specify the start time of RIGHT relative to LEFT, in seconds (--offset; positive if RIGHT "
+        "started later), or trim both videos to the same time span.",
     ),
     FindingKind(
         "config.unknown-parameters",

@@ -134,21 +134,23 @@ class PriorOptions:
 
     prior: str = _prior(
         "bundled",
-        "Depth prior: 'bundled', a hub id such as prs-eth/marigold-depth-v1-1, or a folder; KEY:FOLDER "
-        "selects the adapter for a folder.",
+        "Depth prior: 'bundled', a Hugging Face model ID such as prs-eth/marigold-depth-v1-1, or a folder. "
+        "KEY:FOLDER loads a folder with the adapter KEY, such as marigold.",
     )
     space: str | None = _prior(
         None,
-        f"Space in which the prior is affine-invariant: {', '.join(SPACES)} (default: from its config).",
+        f"Quantity that the prior predicts up to scale and shift: {', '.join(SPACES[:-1])} or {SPACES[-1]} "
+        "(default: from its config).",
         choices=SPACES,
     )
     steps: int | None = _prior(
         None,
-        "Number of denoising steps (default: the prior's own number, at least 4).",
+        "Number of denoising steps (default: the prior's default, raised to the preset's min_steps). "
+        "One-step priors allow only 1.",
         low=1,
         high=1000,
     )
-    seed: int = _prior(0, "Random seed of the noise.", low=0, high=2**63 - 1)
+    seed: int = _prior(0, "Seed for the random noise.", low=0, high=2**63 - 1)
     dtype: str = _prior("float32", "Precision of the prior: float32, float16 or bfloat16.", choices=DTYPES)
     device: str = _prior("auto", "Device: auto, cpu, cuda, cuda:N or mps.", affects=NOTHING)
 
@@ -159,10 +161,10 @@ class SpeedOptions:
 
     cuda_graphs: bool = _speed(
         False,
-        "Run the networks as CUDA graphs, with a faster group norm in half precision (always on for batches "
-        "and captures).",
+        "Run the networks as CUDA graphs, with a faster group norm in half precision. Always on for batches "
+        "and captures on CUDA.",
     )
-    no_triton: bool = _speed(False, "Run all stages in plain torch, without Triton kernels.")
+    no_triton: bool = _speed(False, "Disable the Triton kernels and run all stages in plain PyTorch.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +173,8 @@ class MachineOptions:
 
     engine: str = _machines(
         "local",
-        "Where to run: local (this machine) or ray (Ray Data, one machine or a cluster; needs extra 'ray').",
+        "Where to run: local (this machine) or ray (Ray Data, one machine or a cluster; needs the extra "
+        "'ray').",
         choices=ENGINES,
     )
     workers: int | None = _machines(
@@ -182,7 +185,7 @@ class MachineOptions:
     )
     gpus: float | None = _machines(
         None,
-        "With --engine ray: GPUs per worker, possibly fractional (default: 1 if there are GPUs).",
+        "With --engine ray: GPUs per worker; may be fractional (default: 1 if a GPU is available).",
         low=0,
         high=64,
     )
@@ -200,18 +203,18 @@ class RunOptions(PriorOptions):
     """Run options that ``geodiff depth``, the web app and the ComfyUI node share."""
 
     option: tuple[str, ...] = _prior(
-        (), "Option of the prior as NAME=VALUE, such as domain=outdoor for GeoWizard; repeatable."
+        (), "Prior-specific option as NAME=VALUE, such as domain=outdoor for GeoWizard; repeatable."
     )
     ensemble: int = _prior(
         1,
-        "Number of predictions with different noise; if two or more, their spread is written as the "
-        "uncertainty.",
+        "Number of ensemble predictions, each with different noise. With two or more, their spread is "
+        "written as the uncertainty.",
         low=1,
         high=1000,
     )
     resolution: int | None = _prior(
         None,
-        "Longer side of the prior's input in pixels; 0 keeps the image size (default: the prior's own).",
+        "Longer side of the prior's input in pixels; 0 keeps the image size (default: the prior's default).",
         low=0,
         high=8192,
     )
@@ -219,12 +222,14 @@ class RunOptions(PriorOptions):
     far: float | None = _guidance(None, "Farthest depth to search, in metres.", above_0="metres")
     preset: str = _guidance(
         "default",
-        "Preset: default, fast (coarser matches, poses used as given) or paper (Algorithm 1).",
+        "Preset: default, fast (coarser matches, one match fit, the prior's default number of steps, poses "
+        "used as given) or paper (Algorithm 1).",
         choices=PRESETS,
     )
     parameter: tuple[str, ...] = _guidance(
         (),
-        "Guidance parameter, such as guidance_steps=0; repeatable. geodiff info --parameters lists all.",
+        "Set a guidance parameter, such as guidance_steps=10; repeatable. geodiff info --parameters lists "
+        "all parameters.",
         "--set",
         metavar="NAME=VALUE",
     )
@@ -235,7 +240,7 @@ class RunOptions(PriorOptions):
         names = {name: name_of(option) for name, option in settings_of(type(self)).items()}
         if (self.near is None) != (self.far is None):
             missing, given = ("near", "far") if self.near is None else ("far", "near")
-            raise_input_error(f"{names[given]} needs {names[missing]}. Give both in metres.")
+            raise_input_error(f"{names[given]} needs {names[missing]}. Set both, in metres.")
         if self.near is not None and self.far is not None and self.near >= self.far:
             got = f"{self.near:g} and {self.far:g}"
             hint = "Both are depths in metres."

@@ -67,7 +67,7 @@ def check_intrinsics_fit(K: np.ndarray, width: int, height: int, name: str, imag
     if not (0 <= cx <= width and 0 <= cy <= height):
         raise_input_error(
             f"{name} has its principal point at ({cx:.1f}, {cy:.1f}), outside {image} ({width}x{height} "
-            f"pixels). If {name} is for another resolution, {SCALED_K}. If the image is a crop, set "
+            f"pixels). If {name} is for a different resolution, {SCALED_K}. If the image is a crop, set "
             "cropped=True (--cropped).",
             code="camera.principal-point",
         )
@@ -116,7 +116,9 @@ def _warn_of_principal_point(K: np.ndarray, width: int, height: int, name: str, 
     else:
         return
     sentence = f"{name} has its principal point at ({cx:.1f}, {cy:.1f}), {place}."
-    warn(Finding("camera.principal-point", f"{sentence} If {name} is for another resolution, {SCALED_K}."))
+    warn(
+        Finding("camera.principal-point", f"{sentence} If {name} is for a different resolution, {SCALED_K}.")
+    )
 
 
 def _warn_of_aspect_ratio(K: np.ndarray, name: str) -> None:
@@ -162,7 +164,7 @@ def check_baseline(E: np.ndarray, name: str, unit: str | None) -> None:
     baseline = float(np.linalg.norm(E[:3, 3]))
     if baseline < 1e-6:
         expected = "a pose with a baseline (a camera centre that differs from the left camera's)"
-        hint = "Two views without a baseline have no parallax; give the baseline in metres."
+        hint = "Two views without a baseline have no parallax; pass the baseline in metres."
         bad_value(name, expected, f"a translation of {baseline:.1g} m", hint)
     if unit == "m" and baseline > LONG_BASELINE_M:
         hint = "divide its translation, or baseline_m (--baseline, --metres-per-unit), by 1000."
@@ -176,7 +178,7 @@ def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
         return
     hint = "Divide integers by the number of units per metre: 1000 for millimetres, 256 for KITTI."
     if array.shape[1] == 3:
-        hint = "Divide millimetres by 1000. Metres as integers are truncated: give floats."
+        hint = "Divide millimetres by 1000. Metres as integers are truncated: pass floats."
     bad_value(name, "metres as floats", got or f"dtype {array.dtype}", hint)
 
 

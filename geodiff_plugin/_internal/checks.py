@@ -15,8 +15,8 @@ from geodiff_plugin.findings import Finding
 MAX_GOT = 400
 #: Hint for a negative baseline.
 NEGATIVE_BASELINE = (
-    "A negative baseline means that the left and right images are swapped. Swap them, and give a positive "
-    "baseline."
+    "A negative baseline means that the left and right images are swapped. Swap them, and "
+    "pass a positive baseline."
 )
 #: Findings passed to ``warn`` within the innermost ``captured_warnings`` block.
 _CAPTURED: ContextVar[list[Finding] | None] = ContextVar("captured_warnings", default=None)

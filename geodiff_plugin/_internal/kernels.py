@@ -104,11 +104,11 @@ def launch_bound(tensor: torch.Tensor) -> bool:
 def kernels_in_use() -> str:
     """Describe for ``geodiff info`` whether stages run as kernels on this machine, and if not, why."""
     if not has_triton():
-        return "plain torch: Triton is not installed"
+        return "plain PyTorch: Triton is not installed"
     if interpreting():
         return "Triton's interpreter on the CPU"
     if not torch.cuda.is_available() or torch.version.hip is not None:
-        return "plain torch: kernels need CUDA"
+        return "plain PyTorch: kernels need CUDA"
     return "Triton on CUDA, compiled on the first call on a machine"
 
 

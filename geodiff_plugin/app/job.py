@@ -305,8 +305,8 @@ def _focal(given: CameraFields, size: tuple[int, int]) -> tuple[dict[str, Any], 
 def _by_baseline(given: CameraFields) -> Request:
     if given.baseline is None:
         raise PageError(
-            "Images alone have no scale. Enter the measured distance between the two positions, or choose "
-            "another way to give the scale."
+            "Images alone have no scale. Enter the measured distance between the two positions, or choose a "
+            "different way to set the scale."
         )
     for value, name in ((given.baseline, "The measured distance"), (given.baseline_error, "Its accuracy")):
         _check_positive(value, name)

@@ -191,5 +191,8 @@ def run_app(
             raise
         got = f"{host} and {port or 'no free port'}, which is in use or not an address of this machine"
         bad_value(
-            "--host and --port", "an address with a free port", got, "Choose another port, or omit --port."
+            "--host and --port",
+            "an address with a free port",
+            got,
+            "Choose a different port, or omit --port.",
         )

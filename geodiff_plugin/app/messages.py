@@ -42,8 +42,11 @@ _NOTHING = "No action is needed."
 FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     "image.frames": ("An image file has several pages. The first one is used.", _NOTHING),
     "image.dark": ("A 16-bit image is nearly black.", "Export it at full brightness, or as an 8-bit image."),
-    "image.bits": ("A 16-bit image is read as 10, 12 or 14 bits.", _NOTHING),
-    "image.alpha": ("Transparent pixels get no depth.", "Remove the transparency if they show the scene."),
+    "image.bits": ("A 16-bit image is treated as a 10-, 12- or 14-bit image.", _NOTHING),
+    "image.alpha": (
+        "Transparent pixels get no depth.",
+        "Remove the transparency if these pixels contain scene content.",
+    ),
     "image.rotated": (
         "An image was rotated upright, according to the orientation tag in its file.",
         "Make sure that the calibration is for the upright image.",
@@ -61,8 +64,8 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "For exact lengths, use a calibrated camera.",
     ),
     "camera.from-list": (
-        "The focal length is the manufacturer's value for the camera that you chose. It may be off by a few "
-        "percent, or more if the image was zoomed or cropped.",
+        "The focal length is the manufacturer's value for the camera that you selected. It may be off by a "
+        "few percent, or more if the image was taken with digital zoom or cropped.",
         "Check the camera and the lens in the form.",
     ),
     "camera.from-fov": (
@@ -73,7 +76,10 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "The optical centre is assumed to be at the centre of the image.",
         'Enter fy, cx and cy with "Focal length and baseline" if you know them.',
     ),
-    "camera.zoom": ("An image was zoomed digitally.", "Take it again without zoom, or enter fx."),
+    "camera.zoom": (
+        "An image was taken with digital zoom.",
+        "Take it again without digital zoom, or enter fx.",
+    ),
     "camera.assumed-cx": (
         "The right camera's cx is assumed to be the left camera's.",
         'Enter its cx with "Focal length and baseline" if you know it.',
@@ -95,8 +101,8 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "The calibrations of the left and right camera seem to be swapped.",
         "Swap them in the file, or swap the images.",
     ),
-    "camera.scaled": ("The calibration seems to be for another image size.", _CROP),
-    "camera.focal-scaled": ("The focal length seems to be for another image size.", _CROP),
+    "camera.scaled": ("The calibration seems to be for a different image size.", _CROP),
+    "camera.focal-scaled": ("The focal length seems to be for a different image size.", _CROP),
     "camera.cx-mismatch": (
         "Either the two cameras have different cx values, or the images do not belong together.",
         "Enter the right camera's cx, or use a calibration file for both cameras.",
@@ -114,12 +120,12 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Enter the distance between the cameras.",
     ),
     "calibration.assumed-metres": (
-        "The calibration states no unit, and in metres its cameras would be far apart.",
+        "The calibration states no unit. If it is in metres, the cameras are unusually far apart.",
         "Enter the measured distance between the cameras.",
     ),
     "calibration.unrectified": ("The images are treated as not rectified.", _CALIBRATION),
     "calibration.doffs": ("The right cx in the calibration contradicts doffs.", _CALIBRATION),
-    "calibration.assumed-lens": ("The focal length is the data set's usual one.", _CALIBRATION),
+    "calibration.assumed-lens": ("The focal length is the usual one for this dataset.", _CALIBRATION),
     "calibration.kitti-cameras": ("KITTI's colour cameras are used.", "Use images of the colour cameras."),
     "baseline.long": ("With this baseline, the cameras are more than 20 m apart.", _LENGTH),
     "baseline.short": ("With this baseline, the cameras are less than a millimetre apart.", _LENGTH),
@@ -133,8 +139,11 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Use a calibration file with the vertical offset, or estimate the camera positions from the images.",
     ),
     "pose.unconstrained": ("The images do not determine how the cameras were placed.", _WIDER),
-    "pose.unchecked": ("The calibration could not be checked: too few points match.", _CALIBRATION),
-    "pose.few-matches": ("Too few points match to correct the calibration.", _CALIBRATION),
+    "pose.unchecked": (
+        "The calibration could not be checked: there are too few matching points.",
+        _CALIBRATION,
+    ),
+    "pose.few-matches": ("There are too few matching points to correct the calibration.", _CALIBRATION),
     "pose.kept": ("The images deviate from the calibration by more than a pixel.", _CALIBRATION),
     "pose.refined": ("The calibration was corrected slightly to fit the images.", _NOTHING),
     "pose.too-far": (
@@ -165,7 +174,7 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Measure it, or mark an object whose length you know.",
     ),
     "scale.uncertain": ("The scale is uncertain.", "Enter the measured distance between the cameras."),
-    "views.identical": ("Both images are the same file.", "Choose a second image from another position."),
+    "views.identical": ("Both images are the same file.", "Choose a second image from a different position."),
     "views.shifted": (
         "Everything seems to be at one distance, as if one image were a shifted copy.",
         "Use two images from different positions, with objects at different distances.",
@@ -191,7 +200,7 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     ),
     "views.blocked": ("Part of one image is blank.", "Uncover the lens, and take that image again."),
     "views.repeated-pattern": (
-        "Part of the image is a repeated pattern, such as bars or tiles.",
+        "Part of the image is a repeated pattern, such as a fence or tiles.",
         "Do not measure on it where the confidence is low.",
     ),
     "depth.repeated-pattern": (
@@ -208,11 +217,11 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         _SWAP,
     ),
     "depth.range": (
-        "The scene extends beyond the given depths.",
+        "The scene extends beyond the depths that you entered.",
         "Clear the fields 'Nearest depth' and 'Farthest depth'.",
     ),
     "depth.off-matches": ("The depth does not fit the matched points.", "Choose the preset 'default'."),
-    "depth.order-points": ("The prior contradicts the known depths.", "Choose another prior."),
+    "depth.order-points": ("The prior contradicts the known depths.", "Choose a different prior."),
     "depth.occlusion": ("Far objects hide near ones. The left and right images are probably swapped.", _SWAP),
     "depth.order": (
         "The prior and the matches disagree about which objects are near.",
@@ -227,11 +236,11 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
     "prior.unit": ("The depth differs from what the prior expects by more than a factor of 20.", _LENGTH),
     "prior.metres": ("The depth differs from what the prior expects.", _LENGTH),
     "prior.order": (
-        "The prior swaps near and far, and the matches contradict it.",
+        "According to the matches, the prior swaps near and far.",
         "Do not measure where the confidence is low.",
     ),
     "verdict.not-trusted": ("Do not trust this depth.", "See the reasons."),
-    "verdict.not-judged": ("This depth could not be checked.", "Use images with more overlap and texture."),
+    "verdict.not-judged": ("This depth could not be verified.", "Use images with more overlap and texture."),
 }
 
 #: Code of an input error -> sentence and what to do.
@@ -247,7 +256,7 @@ ERRORS_ON_PAGE: dict[str, tuple[str, str]] = {
         "An image was cropped, so the focal length in its file is not valid.",
         "Use the original image, or choose your camera in the list if it was only resized.",
     ),
-    "calibration.size": ("The calibration is for images of another size.", _CROP),
+    "calibration.size": ("The calibration is for images of a different size.", _CROP),
     "calibration.one-camera": (
         "The calibration file describes one camera.",
         "Add the file for the other camera, or estimate the camera positions from the images.",
@@ -276,7 +285,7 @@ ERRORS_ON_PAGE: dict[str, tuple[str, str]] = {
     "memory": ("The images do not fit in the memory of this server.", "Downscale both images."),
 }
 _UNKNOWN_FORMAT = ("The calibration file is in an unsupported format.", "")
-_OTHER = ("The images and their calibration cannot be used together as given.", _CALIBRATION)
+_OTHER = ("The images and their calibration cannot be used together.", _CALIBRATION)
 
 
 def on_page(finding: Finding, folders: Iterable[Path] = ()) -> Message:

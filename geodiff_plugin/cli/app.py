@@ -57,21 +57,21 @@ def _depth(options: DepthOptions) -> None:
     from geodiff_plugin.jobs import is_many, start_many
 
     if not is_bag(options.left):
-        names = ("topic_left", "topic_right", "tolerance", "encoding")
+        names = ("left_topic", "right_topic", "tolerance", "encoding")
         options.raise_input_error(names, "{} needs a bag as LEFT.")
     if is_bag(options.left):
         _imported("cli.run.run_bag")(options)
     elif is_many(options.left):
         options = replace(options, out=options.out or Path("geodiff-out"))
         refs = start_many(options, silent if options.quiet else say)
-        to_parquet = options.engine == "ray" and options.layout != "folders"
+        to_parquet = options.engine == "ray" and options.format != "folders"
         _imported("cli.run.run_parquet" if to_parquet else "cli.run.run_many")(options, refs)
     else:
         options.raise_input_error(
             ["temporal_smoothing"], "{} needs a sequence of frames: folders, a list, videos or a bag."
         )
         options.raise_input_error(["offset"], "{} applies to two videos.")
-        options.raise_input_error(["shard", "engine"], "{} needs many pairs: give folders, a list or videos.")
+        options.raise_input_error(["shard", "engine"], "{} needs many pairs: pass folders, a list or videos.")
         options = with_folder(options, "geodiff-out")
         with start_pair(options) as folder:
             started = time.perf_counter()
@@ -94,7 +94,7 @@ class _Demo:
     )
     overwrite: bool = _out(False, "Write into a non-empty folder.")
     quiet: bool = _out(False, "Hide the progress bar.", "--quiet", "-q")
-    real: bool = setting(False, "Run on three pairs of a real stereo camera, without ground truth.")
+    real: bool = setting(False, "Run on three pairs from a real stereo camera, without ground truth.")
 
     def run(self) -> None:
         bundled = Path(__file__).resolve().parents[1] / "bundled"
@@ -130,9 +130,13 @@ class _Bench(SpeedOptions, PriorOptions):
 class _Info:
     prior: str | None = setting(None, "Also describe this prior.")
     space: str | None = setting(
-        None, "Space in which it is affine-invariant (default: from its config).", choices=SPACES
+        None,
+        "Quantity that the prior predicts up to scale and shift (default: from its config).",
+        choices=SPACES,
     )
-    parameters: bool = setting(False, "List the guidance parameters with default, range and meaning instead.")
+    parameters: bool = setting(
+        False, "Instead, list the guidance parameters with their defaults, ranges and meanings."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,10 +171,13 @@ class _Merge:
 
 @dataclass(frozen=True, kw_only=True)
 class _Page:
-    prior: tuple[str, ...] = setting(("bundled",), "Prior that visitors can select; repeatable.")
+    prior: tuple[str, ...] = setting(("bundled",), "Prior to offer in the web app; repeatable.")
     device: str = setting("auto", settings_of(PriorOptions)["device"].help)
     dtype: str = setting("float32", settings_of(PriorOptions)["dtype"].help, choices=DTYPES)
-    host: str = setting("127.0.0.1", "Address to listen on; 0.0.0.0 allows other machines.")
+    host: str = setting(
+        "127.0.0.1",
+        "Address to listen on; 0.0.0.0 accepts connections from other machines, without a password.",
+    )
     port: int | None = setting(None, "Port (default: first free port).", low=1, high=65535)
     browser: bool = setting(False, "Open the web app in a browser.")
 
@@ -179,27 +186,38 @@ class _Page:
 class _Convert:
     paths: tuple[Path, ...] = setting(
         MISSING,
-        "SRC DST: a checkpoint (.ckpt, .pth) or folder with .bin weights, and the output folder for "
-        "--prior. Or marigold-v2 BASE CHECKPOINT DST: a Qwen-Image-Edit-2509 folder, the "
-        "trainables.safetensors of Marigold V2, and the output folder.",
+        "SRC DST, where SRC is a checkpoint (.ckpt, .pth) or a folder with .bin weights, and DST is the "
+        "folder to create for --prior. For Marigold V2: marigold-v2 BASE CHECKPOINT DST, where BASE is a "
+        "Qwen-Image-Edit-2509 folder and CHECKPOINT is Marigold V2's trainables.safetensors.",
         "",
         metavar="PATH",
     )
     part: str | None = setting(
-        None, "Parts missing in SRC: a file, folder or hub id (docs/reference/priors.md).", "--with"
+        None,
+        "File, folder or Hugging Face model ID with the parts that are missing from SRC (see the priors page "
+        "of the documentation).",
+        "--with",
     )
-    space: str | None = setting(None, "Space in which marigold-v2 is affine-invariant.", choices=SPACES)
+    space: str | None = setting(
+        None,
+        "Quantity that marigold-v2 predicts up to scale and shift (default: from the checkpoint's folder "
+        "name).",
+        choices=SPACES,
+    )
 
 
 COMMANDS = {
     "depth": Command(
         DepthOptions,
         _depth,
-        "Estimate metric depth of LEFT, guided by RIGHT, for one pair or many.\n\n"
-        "For example: geodiff depth left.png right.png --calib calib.txt",
+        "Estimate metric depth for LEFT, guided by RIGHT, for one pair or many.\n\nFor example: geodiff "
+        "depth left.png right.png --calib calib.txt",
     ),
     "capture": Command(
-        CaptureOptions, _capture, "Estimate metric depth of all frames of a capture, and a fused point cloud."
+        CaptureOptions,
+        _capture,
+        "Estimate metric depth for all frames of a capture and fuse it into a point cloud (needs the extra "
+        "'capture').",
     ),
     "live": Command(
         LiveOptions,
@@ -212,10 +230,12 @@ COMMANDS = {
     "bench": Command(
         _Bench,
         lambda options: _imported("cli.demo.run_bench")(options),
-        "Measure the overhead of guidance and the throughput.",
+        "Measure guidance overhead and throughput.",
     ),
     "video": Command(_Video, _later("cli.results.run_video"), "Create a video from depth maps."),
-    "merge": Command(_Merge, _later("cli.results.run_merge"), "Merge the tables of geodiff depth --shard."),
+    "merge": Command(
+        _Merge, _later("cli.results.run_merge"), "Merge the result tables written by geodiff depth --shard."
+    ),
     "submit": Command(
         _Submit,
         _later("cli.results.run_submit"),
@@ -228,7 +248,7 @@ COMMANDS = {
     "eval": Command(
         None,
         lambda _: _imported("cli.eval.eval_app"),
-        "Evaluate this package and other methods on data sets.",
+        "Evaluate this package and other methods on datasets.",
     ),
 }
 ABOUT = "Metric depth from two images with known cameras, using any Marigold-style diffusion prior."

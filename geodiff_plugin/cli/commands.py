@@ -70,10 +70,10 @@ class _OutermostGroup(_Group):
             with ending_on_sigterm():
                 return super().invoke(ctx)
         except Terminated:
-            say("geodiff: terminated. Run the same command again to resume.")
+            say("geodiff: terminated. Run the same command again to resume or restart.")
             sys.exit(EXIT_TERMINATED)
         except KeyboardInterrupt:
-            say("geodiff: interrupted. Run the same command again to resume.")
+            say("geodiff: interrupted. Run the same command again to resume or restart.")
             sys.exit(EXIT_INTERRUPTED)
         except InputError as error:  # any other error is a bug and keeps its traceback
             say(f"geodiff: {error}")
@@ -202,4 +202,4 @@ def _hint_for_number(typed: str) -> str:
     """Return a hint for a decimal comma or a number with a unit."""
     if "," in typed:
         return "Use a decimal point: 0.12."
-    return "Give only the number; --help states its unit." if typed[:1].isdigit() else ""
+    return "Enter only the number; --help states its unit." if typed[:1].isdigit() else ""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _ListOptions:
-    data: Path | None = setting(None, "Folder with data sets.")
+    data: Path | None = setting(None, "Folder of datasets.")
 
 
 def run_and_show(measure: Callable[[Any], Any], options: Any) -> None:
@@ -68,7 +68,7 @@ def _list(options: _ListOptions) -> None:
     rows = []
     for name, dataset in DATASETS.items():
         count = 0 if options.data is None else len(find_pairs(options.data, [name]))
-        there = "not found" if options.data is not None else "no --data given"
+        there = "not found" if options.data is not None else "no --data set"
         if count or not dataset.needs_folder:
             there = f"{count or 'any number of'} {'sample' if count == 1 else 'samples'}"
         rows.append((name, f"{there}\n{dataset.obtain}"))
@@ -77,11 +77,11 @@ def _list(options: _ListOptions) -> None:
         about = getattr(family, "func", family).__doc__  # the docstring of a partial's function
         summary = re.split(r"[.;]", about or " ", maxsplit=1)[0]
         rows.append((f"{name}:...", f"{summary[0].lower()}{summary[1:]}"))
-    rows.append(("METHOD@PRIOR", "a method with another prior than --prior"))
-    rows.append(("METHOD#SEED", "a method with another seed than --seed; METHOD@PRIOR#SEED for both"))
+    rows.append(("METHOD@PRIOR", "a method with a different prior from --prior"))
+    rows.append(("METHOD#SEED", "a method with a different seed from --seed; METHOD@PRIOR#SEED for both"))
     print_lines(rows)
 
 
-LIST = Command(_ListOptions, _list, "List data sets and methods.")
+LIST = Command(_ListOptions, _list, "List datasets and methods.")
 _COMMANDS = {name: each._replace(run=partial(run_and_show, each.run)) for name, each in COMMANDS.items()}
-eval_app = new_group("Evaluate this package and other methods on data sets.", _COMMANDS | {"list": LIST})
+eval_app = new_group("Evaluate this package and other methods on datasets.", _COMMANDS | {"list": LIST})

@@ -41,7 +41,7 @@ FIRST_FILES = ("overview.png", "depth.npy", "cloud.ply")
 #: Maximum number of rows of a full table. Longer tables show only failed and untrusted pairs.
 MAX_ROWS = 20
 #: Hint for a capture without a metric scale.
-GIVE_LENGTH = "for metres give --known-length or --distance"
+GIVE_LENGTH = "for metres pass --known-length or --distance"
 
 
 def _notify(options: DepthOptions | CaptureOptions) -> Notify:

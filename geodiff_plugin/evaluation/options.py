@@ -60,9 +60,10 @@ def listed(default: tuple[Any, ...], help_text: str, **rules: Any) -> Any:
     return setting(default, help_text, comma_separated=True, **{"section": SAMPLES, **rules})
 
 
-def some_of(names: Collection[str]) -> Any:
+def some_of(names: Collection[str], help_text: str = "") -> Any:
     """Create a comma-separated option with some of these names (default: all)."""
-    return listed(tuple(names), f"Rows, separated by commas: {', '.join(names)}.", choices=names)
+    help_text = help_text or f"Rows, separated by commas: {', '.join(names)}."
+    return listed(tuple(names), help_text, choices=names)
 
 
 def count_of(
@@ -73,7 +74,7 @@ def count_of(
 
 
 def folder_of(help_text: str, *flags: str, default: Any = None) -> Any:
-    """Create an option for a folder or the name of a registered data set."""
+    """Create an option for a folder or the name of a known dataset."""
     return setting(default, help_text, *flags, metavar="DIR", section=SAMPLES)
 
 
@@ -81,9 +82,9 @@ def folder_of(help_text: str, *flags: str, default: Any = None) -> Any:
 class OutOptions:
     """Options of every command."""
 
-    seed: int = setting(0, "Random seed of the noise.", section=PRIOR)
+    seed: int = setting(0, "Seed for the random noise.", section=PRIOR)
     steps: int | None = count_of(
-        None, "Number of denoising steps (default: each method's own).", high=1000, section=PRIOR
+        None, "Number of denoising steps (default: each method's default).", high=1000, section=PRIOR
     )
     out: Path = out_folder("geodiff-eval")
     results: Path | None = setting(None, "Also write the results as Markdown to this file.", section=OUTPUT)
@@ -114,19 +115,21 @@ class EvalOptions(SpeedOptions, OutOptions, PriorOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class SampleOptions(EvalOptions):
-    """Options that select data sets and samples."""
+    """Options that select datasets and samples."""
 
-    data: Path | None = folder_of("Folder with data sets, or the name of a registered data set.")
+    data: Path | None = folder_of(
+        "Folder of datasets, or the name of a known dataset (see geodiff eval list)."
+    )
     methods: tuple[str, ...] = listed(
         (), "Additional methods, separated by commas; geodiff eval list shows them."
     )
-    datasets: tuple[str, ...] = listed((), "Data sets, separated by commas (default: all in the folder).")
+    datasets: tuple[str, ...] = listed((), "Datasets, separated by commas (default: all in the folder).")
     scenes: tuple[str, ...] = listed(
         (), "Only samples whose names contain one of these words, separated by commas."
     )
     limit: int | None = count_of(
         None,
-        "Maximum number of samples, taken from the start of the list (in the paper's tables: per data set).",
+        "Maximum number of samples, taken from the start of the list (in the paper's tables: per dataset).",
     )
     ensemble: int = count_of(1, "Number of ensemble members.", high=1000, section=PRIOR)
     resolution: int | None = count_of(None, "Longer side of the prior's input in pixels.", 0, 8192, PRIOR)
@@ -179,12 +182,12 @@ class DirOptions(MachineOptions, PairsOptions):
     """Options of ``geodiff eval pairs DIR``."""
 
     data: Path | None = folder_of(
-        "Folder of data sets, or the name of a registered data set.", "", default=MISSING
+        "Folder of datasets, or the name of a known dataset (see geodiff eval list).", "", default=MISSING
     )
     methods: tuple[str, ...] = listed(PEERS, "Methods, separated by commas; geodiff eval list shows them.")
     split: str = setting(
         "all",
-        "Pairs: all, tuned (constants were chosen on them), or unseen (nothing was tuned on them).",
+        "Pairs to evaluate: all, tuned (used to tune the defaults) or unseen (held out).",
         choices=("all", "tuned", "unseen"),
         section=SAMPLES,
     )
@@ -208,19 +211,24 @@ class FigureOptions(SampleOptions):
         high=10**4,
     )
     results: Path | None = field(default=None)
-    clouds: bool = setting(False, "qualitative, ablation: also draw point clouds from another viewpoint.")
+    clouds: bool = setting(False, "qualitative, ablation: also draw point clouds from a different viewpoint.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosesOptions(EvalOptions):
     """Options of ``geodiff eval poses``."""
 
-    data: Path | None = folder_of("Folder of pairs, or the name of a registered data set (default: none).")
-    limit: int | None = count_of(None, "Maximum number of pairs of --data, from the first.")
-    exact: Path | None = folder_of("Folder or name of pairs with exact poses, which are perturbed.")
+    data: Path | None = folder_of(
+        "Folder of pairs, or the name of a known dataset (see geodiff eval list; default: none)."
+    )
+    limit: int | None = count_of(None, "Maximum number of pairs, taken from the start of --data.")
+    exact: Path | None = folder_of(
+        "Folder, or name of a known dataset, whose pairs have exact poses. These poses are perturbed."
+    )
     perturb: str = setting(
         "1.5,0.1",
-        "Perturbation of --exact: a rotation in degrees and a translation as a fraction of the baseline.",
+        "Perturbation of the poses in --exact: a rotation in degrees and a translation as a fraction of the "
+        "baseline.",
         metavar="DEGREES,FRACTION",
     )
     drift: str = setting(
@@ -244,9 +252,16 @@ class CaptureEvalOptions(EvalOptions):
         None, "Number of evenly spaced frames of each capture, instead of --frames.", 2
     )
     neighbours: tuple[int, ...] = listed(
-        (2, 3, 5), "Numbers of right views, separated by commas.", low=1, high=32
+        (2, 3, 5),
+        "Numbers of neighbouring frames to match each frame with, separated by commas.",
+        low=1,
+        high=32,
     )
-    rows: tuple[str, ...] = some_of(CAPTURE_ROWS)
+    rows: tuple[str, ...] = some_of(
+        CAPTURE_ROWS,
+        "Poses to evaluate, separated by commas: given, pairs (refined per pair) or capture (refined "
+        "jointly).",
+    )
 
 
 def _run(name: str, where: str, options: OutOptions) -> Any:
@@ -271,23 +286,29 @@ _TABLE = {
         "Compare methods on all pairs in DIR with metric ground truth.",
     ),
     "table1": _Entry(
-        PaperOptions, _PAPER, "Table 1 of the paper: KITTI, Booster and Middlebury, in metres and aligned."
+        PaperOptions,
+        _PAPER,
+        "Table 1 of the paper: KITTI, Booster and Middlebury, as metric depth and after alignment to ground "
+        "truth.",
     ),
     "table2": _Entry(PaperOptions, _PAPER, "Table 2 of the paper: Booster, compared with stereo matching."),
     "table3": _Entry(PaperOptions, _PAPER, "Table 3 of the paper: two posed views of Tanks and Temples."),
     "ablation": _Entry(
-        PaperOptions, _PAPER, "Table 4 of the paper, and one change at a time: gradients, optimizers, terms."
+        PaperOptions,
+        _PAPER,
+        "Table 4 of the paper, and variants with a single change: gradients, optimizers or loss terms.",
     ),
-    "parts": _Entry(PairsOptions, _CHANGES, "Ablation: the default without one part at a time."),
+    "parts": _Entry(PairsOptions, _CHANGES, "Ablation: remove one component of the default at a time."),
     "flatness": _Entry(
-        PairsOptions, _CHANGES, "Sensitivity: the default with one parameter halved or doubled at a time."
+        PairsOptions, _CHANGES, "Sensitivity: halve and double one parameter of the default at a time."
     ),
     "cost": _Entry(PairsOptions, "pairs.run_cost", "Run time and peak memory, plain and guided."),
     "figure": _Entry(FigureOptions, "figures.run_figure", "Draw a figure as PNG, with its numbers as JSON."),
     "baseline": _Entry(
         PairsOptions,
         "baseline_scale.run_baseline_scale",
-        "Measure whether depth follows the baseline at half and twice its length, and another right K.",
+        "Measure whether the depth scales with the baseline when it is halved or doubled, and stays the same "
+        "when the right image is resized (and so has a different K).",
     ),
     "poses": _Entry(PosesOptions, "poses.run_poses", "Compare given, refined, estimated and wrong poses."),
     "capture": _Entry(

@@ -220,7 +220,7 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
     ablation = name == "ablation"
     if options.data is None and not ablation:
         obtain = " ".join(f"{c.title}: {DATASETS[c.datasets[0]].obtain}" for c in layout.columns)
-        bad_value("--data", "given", "nothing", obtain)
+        bad_value("--data", "set", "nothing", obtain)
     if posed:
         options = replace(options, pairs="all")
     columns = _ablation_columns(options) if ablation else layout.columns

@@ -128,7 +128,7 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
     """Measure two views, three views if available, drifted rectified pairs, and perturbed exact ones."""
     change, drift = two_numbers(options.perturb, "--perturb"), two_numbers(options.drift, "--drift")
     if options.data is None and options.exact is None:
-        bad_value("--data", "given, or --exact", "neither")
+        bad_value("--data", "set, or --exact", "neither")
     real = _pairs_below(options.data)[: options.limit]
     exact = _pairs_below(options.exact)
     comparisons = [*_of_real(real, drift), _of_exact(exact, change)]

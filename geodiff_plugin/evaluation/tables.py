@@ -309,7 +309,7 @@ def split_tables(records: Sequence[Record]) -> list[Table]:
 def benchmark_tables(records: Sequence[Record]) -> list[Table]:
     """Return the metrics of the data sets' own benchmarks, for rectified and for posed pairs."""
     done = [record for record in records if record["status"] == "ok" and record["all_pixels"]["raw"]]
-    columns: dict[str, CellOf] = {"data set": lambda group: group[0]["dataset"], "method": method_title}
+    columns: dict[str, CellOf] = {"dataset": lambda group: group[0]["dataset"], "method": method_title}
     columns |= {"pairs": lambda group: str(len(group)), "AbsRel": mean_of("all_pixels.raw.abs_rel")}
     bad: dict[str, CellOf] = {
         "bad": lambda group: f"> {group[0]['benchmark']['bad_px']:g} px",
@@ -320,7 +320,7 @@ def benchmark_tables(records: Sequence[Record]) -> list[Table]:
     rectified = [record for record in done if record.get("benchmark")]
     posed = [record for record in done if record.get("rectified") is False]
     by = ("dataset", "method")
-    title = "Metrics of the data sets' benchmarks"
+    title = "Metrics of the datasets' benchmarks"
     return [
         table_of_groups(f"{title}, rectified pairs", rectified, by, columns | bad, _BAD_NOTE),
         table_of_groups(f"{title}, posed pairs", posed, by, columns | near, _NEAR_NOTE),
@@ -354,9 +354,10 @@ REGIONS = "AbsRel by region and material"
 
 
 _BAD_NOTE = (
-    "Fraction of pixels with a disparity error above the threshold, at the resolution of the files. A hole "
-    "is an error. All: pixels with ground truth. Noc: without pixels that the data set marks as occluded "
-    "(disp_noc, mask0nocc.png, or the right view's disparities). A dash: no file with that information."
+    "Fraction of pixels with a disparity error above the threshold, at the resolution of the files. "
+    "A hole is an error. All: pixels with ground truth. Noc: without pixels that the dataset marks as "
+    "occluded (disp_noc, mask0nocc.png, or the right view's disparities). A dash: no "
+    "file with that information."
 )
 _NEAR_NOTE = (
     "Metres, without alignment. Inliers: depths within 3 % of the ground truth, as in the Robust Multi-View "
@@ -380,7 +381,7 @@ DETAILS: dict[str, Details] = {
             **{"matched": "matched", "unmatched": "unmatched", "tom": "ToM", "not_tom": "other material"},
         },
         "Under the cap; aligned for methods with relative depth only. Visible and occluded need a mask of "
-        "the data set, out of view does not. Matched: our plane sweep of both views has a match with a "
+        "the dataset, out of view does not. Matched: our plane sweep of both views has a match with a "
         "confidence of at least 0.5; the same pixels for every method. ToM: transparent or mirror (classes "
         "2, 3).",
     ),

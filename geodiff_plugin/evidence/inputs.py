@@ -112,7 +112,7 @@ def read_inputs(given: Arguments, *, cropped: bool = False, unit: str | None = "
     if right is None and points is None:
         bad_value("right", "an image, or None together with points", "None without points")
     if points is None and given.points_confidence is not None:
-        bad_value("points_confidence", "given with points", "no points")
+        bad_value("points_confidence", "passed together with points", "no points")
     lists = [x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)]
     count = len(lists[0]) if lists else 1
     if right is not None and not isinstance(right, list) and count == 1:
@@ -132,7 +132,7 @@ def read_inputs(given: Arguments, *, cropped: bool = False, unit: str | None = "
 def _check_for_all(name: str, given: list[bool]) -> None:
     """Raise an error for an argument that is given for some left images only."""
     if any(given) and not all(given):
-        bad_value(name, "given for every left image or for none", f"None for {given.index(False)}")
+        bad_value(name, "passed for every left image or for none", f"None for {given.index(False)}")
 
 
 def _read_image(given: Arguments, label: str, cropped: bool, unit: str | None) -> Inputs:

@@ -159,7 +159,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         PosedCameras(posed.vins_cameras, K="fx fy cx cy", size="image_width image_height", model="model_type",
             lenses={"PINHOLE": ("opencv", "k1 k2 p1 p2"), "KANNALA_BRANDT": ("fisheye", "k2 k3 k4 k5")},
             to_world=("body_T_cam",),
-            hint="Calibrate with --camera-model pinhole or kannala-brandt, or give Kalibr's camchain.yaml."),
+            hint="Calibrate with --camera-model pinhole or kannala-brandt, or pass Kalibr's camchain.yaml."),
         companions=posed.vins_files),
     "kalibr": CalibrationFormat(
         "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$|^[ \t]+T_cn_cnm1[ \t]*:",

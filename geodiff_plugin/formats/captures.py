@@ -297,7 +297,7 @@ def _intrinsics(
     if camera is not None and camera.K is not None:
         return resized(camera, size, frame.image.name, "For a crop, pass --K.").K
     if frame.index is not None:
-        bad_value("K", "given by --K or --fov", "none", "A video has no focal length.")
+        bad_value("K", "set by --K or --fov", "none", "A video has no focal length.")
     # The message starts with the frame's name and must be equal for all frames.
     return intrinsics_from_exif(frame.image, "the image", as_stored=as_stored)[0]
 

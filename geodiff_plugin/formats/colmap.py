@@ -327,7 +327,7 @@ def _largest(models: Iterable[Files], project: Path) -> _Chosen:
         return _Chosen(files, model)
     text = f"{files[0].parent.relative_to(project)}, with {len(model.images)} images, is used"
     finding = f"{text}, the largest of {len(read)} models; ignored: {', '.join(others)}."
-    findings = (Finding("capture.part", f"{finding} To use another, pass its folder."),)
+    findings = (Finding("capture.part", f"{finding} To use a different one, pass its folder."),)
     return _Chosen(files, model, findings)
 
 

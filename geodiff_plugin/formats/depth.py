@@ -146,7 +146,7 @@ def disparity_of_depth(
     depth_m: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray
 ) -> np.ndarray:
     """Compute disparity in pixels of a rectified rig, ``fx baseline / Z - doffs``; infinity where unknown."""
-    shift = K_left[0, 0] * _baseline(E, "a submission", "a pair with another pose")
+    shift = K_left[0, 0] * _baseline(E, "a submission", "a pair with a different pose")
     known = np.isfinite(depth_m) & (depth_m > 0)
     inverse = np.where(known, 1.0 / np.where(known, depth_m, 1.0), np.inf)
     return (shift * inverse - (K_right[0, 2] - K_left[0, 2])).astype(np.float32)

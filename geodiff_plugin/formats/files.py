@@ -282,7 +282,7 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
         if "pickle" in reason:  # numpy's message suggests allow_pickle, also for other files
             with open(path, "rb") as file:
                 pickled = file.read(1) in (b"\x80", b"\x93")
-            reason = "pickled objects, which are never loaded" if pickled else "it is of another format"
+            reason = "pickled objects, which are never loaded" if pickled else "it is in a different format"
         bad_value(name, expected, f"{path}, which numpy cannot load ({reason})", hint)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         bad_value(name, expected, f"{path} without an array of real numbers", hint)

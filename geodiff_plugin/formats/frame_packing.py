@@ -151,7 +151,8 @@ def _inferred(packing: Packing, name: str, view: Size, source: str, lead: float)
     other = packing.squeezed(packing.stretch == (1, 1)).layout
     if lead > CLEAR_LEAD:
         return Finding(
-            "pairs.side-by-side", f"{sentence} Pass --side-by-side {other}, or another, if this is wrong."
+            "pairs.side-by-side",
+            f"{sentence} If this is wrong, pass --side-by-side {other}, or a different layout.",
         )
     factor = {FULL: ", and the depth is half of this", HALF: ", and the depth is twice this"}.get(layout, "")
     hint = f"If they are {ARRANGEMENTS[other]}{factor}, pass --side-by-side {other}."

@@ -102,7 +102,10 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[Finding]]:
     if value.shape[-1] == 4:
         value = value[..., :3]
         findings.append(
-            Finding("image.alpha", f"{name} has an alpha channel: pixels with alpha 0 are not valid.")
+            Finding(
+                "image.alpha",
+                f"{name} has an alpha channel: fully transparent pixels (alpha 0) are treated as invalid.",
+            )
         )
     if value.dtype in (np.uint8, np.uint16):
         findings += _dark_findings(int(value.max()), name) if value.dtype == np.uint16 else []
@@ -140,7 +143,7 @@ def read_image(
     findings += more
     if is_reoriented:
         text = f"{name} was rotated or mirrored to {upright.width}x{upright.height} by its EXIF orientation"
-        findings.append(Finding("image.rotated", f"{text}; K must refer to the upright image."))
+        findings.append(Finding("image.rotated", f"{text}; pass K for the upright image."))
     return image_01, findings
 
 
@@ -249,7 +252,7 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         hwc, of_pixels = _to_01(_array_of(value, name), name)
         findings = of_file + of_pixels
         if value.getexif().get(ORIENTATION) in ORIENTATIONS:
-            hint = "apply it with PIL.ImageOps.exif_transpose and pass K of the upright image."
+            hint = "apply it with PIL.ImageOps.exif_transpose and pass K for the upright image."
             sentence = f"{name} has an EXIF orientation that is not applied; {hint}"
             findings.append(Finding("image.orientation", sentence))
     else:
@@ -313,7 +316,7 @@ def intrinsics_from_exif(
         fy = fx * (number(Base.FocalPlaneYResolution) or per_unit_x) / per_unit_x
         focal = f"{focal_mm:g} mm on its sensor"
     else:
-        bad_value(f"K of {name}", "given", "no focal length in its EXIF", HINT, code="exif.missing")
+        bad_value(f"K of {name}", "specified", "no focal length in its EXIF", HINT, code="exif.missing")
     findings = [Finding("camera.from-exif", f"K of {name}: {focal} in EXIF, {fx:.0f} px.")]
     if zoom > 1.01:
         sentence = (
@@ -333,7 +336,7 @@ def warn_of_other_lens(source: PathLike | Image.Image, K: np.ndarray, name: str)
     zoomed = any(finding.code == "camera.zoom" for finding in findings)
     if not zoomed and max(factor, 1 / factor) >= _OTHER_LENS:
         factor_text = f"{factor:.2f} times the {theirs[0, 0]:.0f} px in its EXIF"
-        hint = "If K is for another image size, depth is wrong by that factor. Check K."
+        hint = "If K is for a different image size, depth is wrong by that factor. Check K."
         sentence = f"K has a focal length of {K[0, 0]:.0f} px for {name}, {factor_text}. {hint}"
         warn(Finding("camera.focal-mismatch", sentence), stacklevel=3)
 

@@ -177,7 +177,7 @@ def _lenses(arrays: Arrays, named: Entries) -> list[Any]:
     if unrecognised or any(each.any() for each in single):
         got = ", ".join(unrecognised) or "for one of them"
         hint = "Name lens distortion D1 and D2 (zeros for no distortion), and other matrices differently."
-        bad_value("the lens distortion", "given for both cameras (D1, D2)", got, hint)
+        bad_value("the lens distortion", "specified for both cameras (D1, D2)", got, hint)
     return [(), ()]
 
 

@@ -69,7 +69,7 @@ def reason_of(error: OSError) -> str:
 
 def raise_unwritable(path: Path, error: OSError) -> NoReturn:
     """Raise an error for an output folder that is not writable."""
-    hint = "Choose another --out, or free disk space and check its permissions."
+    hint = "Choose a different --out, or free disk space and check its permissions."
     bad_value("--out", "a writable folder", f"{path} ({reason_of(error)})", hint)
 
 
@@ -106,7 +106,7 @@ def check_new(path: Path, overwrite: bool) -> Path:
     """Call ``check_out`` for a folder that must be new or empty, unless it may be overwritten."""
     target = check_out(path)
     if _holds_files(target) and not overwrite:
-        hint = "Choose another, or add --overwrite."
+        hint = "Choose a different one, or add --overwrite."
         bad_value("--out", "a new or empty folder", f"{path}, which contains files", hint)
     return target
 
@@ -114,7 +114,9 @@ def check_new(path: Path, overwrite: bool) -> Path:
 def check_new_file(path: Path, overwrite: bool) -> None:
     """Raise an error if an output file exists and may not be overwritten."""
     if path.exists() and not overwrite:
-        bad_value("--out", "a new file", f"{path}, which exists", "Choose another, or add --overwrite.")
+        bad_value(
+            "--out", "a new file", f"{path}, which exists", "Choose a different one, or add --overwrite."
+        )
 
 
 def free_folder(default: Path) -> Path:
@@ -167,7 +169,7 @@ def locked_folder(folder: Path, *, shared: bool = False) -> Iterator[None]:
                 raise_unwritable(folder, error)
             if file is None:
                 got = f"{folder}, which another run is using"
-                hint = "Wait for it, or choose another."
+                hint = "Wait for it, or choose a different one."
                 bad_value("--out", "a folder that no other run uses", got, hint)
             stack.callback(_unlock, path, file)
         yield
@@ -276,7 +278,7 @@ class OutFolder:
         for path in self._inputs:
             if any(path.exists() and path.samefile(file) for file in files):
                 got = f"{self.path}, which holds {path}"
-                bad_value("--out", "a folder without inputs of the run", got, "Choose another.")
+                bad_value("--out", "a folder without inputs of the run", got, "Choose a different one.")
 
     def _begin(self, stack: ExitStack) -> None:
         """Create and lock the hidden folder, and delete leftovers of a killed run."""
@@ -288,7 +290,9 @@ class OutFolder:
         # A run that started before the folder existed writes next to it.
         if (staging != sibling and _held(sibling)) or _lock(staging / LOCK, stack) is None:
             got = f"{self.path}, which another process is writing to"
-            bad_value("--out", "a folder that no other run uses", got, "Wait for it, or choose another.")
+            bad_value(
+                "--out", "a folder that no other run uses", got, "Wait for it, or choose a different one."
+            )
         stack.callback(shutil.rmtree, staging, ignore_errors=True)
         if shutil.disk_usage(staging).free < MIN_FREE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

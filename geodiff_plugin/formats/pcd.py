@@ -17,7 +17,7 @@ from geodiff_plugin._internal.checks import bad_value, raise_input_error
 TYPES = {"F": "f", "U": "u", "I": "i"}
 HEAD = re.compile(rb"[\s\S]{0,4000}?^DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE)
 DAMAGED = "The compressed numbers are damaged."
-HINT = "It may be truncated, or of another format."
+HINT = "It may be truncated, or in a different format."
 #: Number of bytes of the compressed and uncompressed sizes, before the compressed data.
 SIZES_BYTES = 8
 #: LZF: a control byte below this is the number of literal bytes minus one; others start a copy.

@@ -151,5 +151,5 @@ def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
         points = np.empty((0, 3))
     if count is None or not 0 < int(count.group(1)) == len(points):
         expected = "a whole PLY file whose vertices have x, y and z"
-        bad_value(name, expected, path, "It may be truncated, or of another format.")
+        bad_value(name, expected, path, "It may be truncated, or in a different format.")
     return points

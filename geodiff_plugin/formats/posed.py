@@ -127,7 +127,7 @@ class PosedCameras:
     def _pair(self, cameras: Cameras, choice: CameraChoice) -> tuple[int, int]:
         if self.is_asked and len(cameras) > 2 and choice.cameras is None:
             numbered = ", ".join(f"{n} ({entries['name']})" for n, entries in cameras.items())
-            bad_value("cameras", f"given, two of {numbered}", "none", "Pass --cameras LEFT,RIGHT.")
+            bad_value("cameras", f"specified, two of {numbered}", "none", "Pass --cameras LEFT,RIGHT.")
         return two_cameras(choice, cameras, (0, 1))
 
     def camera(self, entries: Entries, name: str) -> RawCamera:
@@ -335,7 +335,7 @@ def _mrcal_camera(text: str) -> Entries:
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         model = None
     if not isinstance(model, dict):
-        bad_value("the file", "a camera model of mrcal", "another text", "The file may be truncated.")
+        bad_value("the file", "a camera model of mrcal", "a different text", "The file may be truncated.")
     numbers = array_of(model["intrinsics"], (-1,), "intrinsics")
     kind = str(model["lensmodel"])
     if kind in MRCAL_COUNTS:

@@ -52,7 +52,7 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
         if not fits:
             expected = f"in a known format ({', '.join(CALIBRATION_FORMATS)})"
             hint = "Check the file, or pass fx, fy, cx, cy and baseline, or K and E."
-            got = f"{path}, in another format"
+            got = f"{path}, in a different format"
             bad_value("calibration", expected, got, hint, UnknownFormatError)
         names.add(fits[0])
     if len(names) != 1:
@@ -137,7 +137,7 @@ def read_calibration(
     if cameras is not None and not entry.uses_cameras:
         bad_value("cameras", "omitted for a file of two cameras", cameras, "It selects among more than two.")
     choice = CameraChoice(cameras, image_folder_hint, image_names, image_size, baseline_m)
-    other = "It may be from another program, or of a single camera."
+    other = "It may be from a different program, or describe a single camera."
     with reading_file(source, entry.summary, *texts.values(), hint=other):
         rig = replace(entry.read(_with_companions(entry, texts), choice), source=source)
     for side, lens in (("left", rig.left.lens), ("right", rig.right.lens)):

@@ -126,7 +126,7 @@ def _ended_early(error: Exception) -> bool:
 
 @contextmanager
 def reading_file(
-    source: object, summary: str, *texts: str, hint: str = "Check that it is the right kind of file."
+    source: object, summary: str, *texts: str, hint: str = "Check that it is the correct kind of file."
 ) -> Iterator[None]:
     """Convert any error of reading files inside the block to a message with their names.
 
@@ -230,7 +230,9 @@ def two_cameras(
 def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, str]:
     """Return the names of both images in a file; given names may omit folders or the suffix."""
     if choice.image_names is None:
-        bad_value("image_names", "given for a file of many images, such as ('left.jpg', 'right.jpg')", "none")
+        bad_value(
+            "image_names", "specified for a file of many images, such as ('left.jpg', 'right.jpg')", "none"
+        )
     numbers = []
     for wanted in choice.image_names:
         in_common = {name: _parts_in_common(name, str(wanted)) for name in names}

@@ -139,7 +139,7 @@ def _rig_of_infos(infos: list[Entries], choice: CameraChoice) -> Rig:
     binnings = [_binning(info, choice) for info in infos]
     sizes = [_image_size(info, binning) for info, binning in zip(infos, binnings, strict=True)]
     if any(_of_ros(info, "P") is None for info in infos):
-        bad_value("projection_matrix", "given in both files", "none", ROS_ALONE)
+        bad_value("projection_matrix", "specified in both files", "none", ROS_ALONE)
     projections = [_projection(info, binning) for info, binning in zip(infos, binnings, strict=True)]
     if not all(P.any() for P in projections):
         got = "zeros: the camera is not calibrated, or not as part of a pair"

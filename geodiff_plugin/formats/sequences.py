@@ -109,7 +109,7 @@ def _assumed(kind: str, camera: RawCamera | None) -> tuple[Finding, ...]:
     """Return a finding on a published camera, which may differ from the actual one."""
     if camera is not SEVEN_SCENES and camera is not TUM_RGBD:
         return ()
-    sentence = f"K of {kind} is assumed (525 px at 640x480). Pass --K for another."
+    sentence = f"K of {kind} is assumed (525 px at 640x480). Pass --K for a different camera."
     return (Finding("capture.assumed-k", sentence),)
 
 

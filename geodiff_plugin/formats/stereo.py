@@ -282,7 +282,7 @@ def read_kitti(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 def left_projection_of_kitti(text: str, choice: CameraChoice) -> np.ndarray:
     """Return the ``(3, 4)`` projection of ``read_kitti``'s left camera; raise for other formats."""
     if not re.search(r"(?m)^\s*P(?:_rect_|)\d+\s*:", text):
-        bad_value("calibration", "KITTI's (P_rect_02, or P0 to P3)", "another format")
+        bad_value("calibration", "KITTI's (P_rect_02, or P0 to P3)", "a different format")
     return _kitti_projections(text, choice)[0][0]
 
 

@@ -96,7 +96,11 @@ def nerf_frames(text: str) -> Iterator[Frame]:
     """Yield every frame, completed with entries of the whole file."""
     data = json.loads(text)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
-        got = f"with {', '.join(map(str, data)) or 'nothing'}" if isinstance(data, dict) else "another value"
+        got = (
+            f"with {', '.join(map(str, data)) or 'nothing'}"
+            if isinstance(data, dict)
+            else "a different value"
+        )
         hint = "Names are lower case: frames, file_path, transform_matrix."
         bad_value("transforms.json", "an object with a list 'frames'", got, hint)
     shared = {key: value for key, value in data.items() if key not in ("frames", "transform_matrix")}
@@ -175,7 +179,7 @@ def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     left, right = (frames[name] for name in names_of_pair(frames, choice))
     poses = [pose for pose in map(nerf_pose, (left, right)) if pose is not None]
     if len(poses) < 2:
-        bad_value("transform_matrix", "given for both images", "none for one of them")
+        bad_value("transform_matrix", "specified for both images", "none for one of them")
     E = np.linalg.inv(poses[0]) @ poses[1]
     return make_rig(nerf_camera(left, choice.image_size), nerf_camera(right, choice.image_size), E)
 

@@ -135,7 +135,7 @@ CAPTURES = tuple(UnreadFormat(*row) for row in (
      f"{TO_TRANSFORMS} (pykitti computes them), or pass two images to geodiff depth with --calib."),
     ("pose_intrinsic_imu.json", "", "ScanNet++ phone poses",
      "Pass the scene, whose dslr/ is supported, or write these as transforms.json."),
-    ("scene_camera.json", "", "BOP data set cameras",
+    ("scene_camera.json", "", "BOP dataset cameras",
      "Write its cam_R_w2c and cam_t_w2c, in millimetres, as transforms.json."),
     ("*.txt", r"\A\S+\.(?i:jpe?g|png)(?:[ \t]+[-+.\deE]+){9}[ \t]*$", "ACE0 poses",
      "Write them as transforms.json: w x y z and the translation are world-to-camera."),

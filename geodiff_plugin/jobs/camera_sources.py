@@ -131,7 +131,7 @@ def find_source(options: Any) -> CameraSource:
     if len(taken) > 1:
         what = "K is" if options.estimate_pose else "The cameras are"
         ways = " and ".join(source.title for source in taken)
-        raise_input_error(f"{what} given in several ways ({ways}). Give one of: {known}.")
+        raise_input_error(f"{what} specified in several ways ({ways}). Pass only one of: {known}.")
     if not taken and not options.estimate_pose:
         unposed = ", or --estimate-pose --baseline METRES for images without poses"
         known += unposed if options.right is not None else ""

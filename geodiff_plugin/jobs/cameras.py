@@ -283,7 +283,7 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> tuple[Distortion
         pair = typed[0], typed[-1]
     if options.view_k and not further and any(is_distorted(lens) for lens in pair):
         hint = "Pass each lens with --view-distortion (0,0,0,0 for no distortion)"
-        raise_input_error(f"--view-K is given, and LEFT has lens distortion. {hint}.")
+        raise_input_error(f"--view-K is set, and LEFT has lens distortion. {hint}.")
     if is_distorted(pair[0]):
         names = ("points_confidence", "disparity", "prior_map")
         hint = "Rectify the images, or pass a map of undistorted.png, which a first run writes"
@@ -296,9 +296,9 @@ def _check_typed_lenses(typed: Sequence[Distortion | None], rig: Rig | None) -> 
     """Reject more than two ``--distortion``, and lens distortion with a rectified rig."""
     if len(typed) > 2:
         raise_input_error(
-            f"--distortion is given {len(typed)} times. Pass it once for both lenses, or once per lens."
+            f"--distortion was passed {len(typed)} times. Pass it once for both lenses, or once per lens."
         )
     if rig is not None and rig.rectified and any(is_distorted(lens) for lens in typed):
-        rectified = f"--distortion is given, but {rig.source} is for rectified images"
+        rectified = f"--distortion is set, but {rig.source} is for rectified images"
         hint = "Pass the rectified images, or the raw images with --K, --K-right and --E."
         raise_input_error(f"{rectified}. {hint}")

@@ -107,7 +107,7 @@ def _check_prior(options: DepthOptions) -> None:
 
 def _alone(options: DepthOptions) -> DepthOptions:
     """Return the options of a pair by itself, so that its report equals one made without Ray."""
-    return replace(options, engine="local", layout=None, workers=None, gpus=None)
+    return replace(options, engine="local", format=None, workers=None, gpus=None)
 
 
 def _bar(total: int, finished: int, progress: bool) -> tqdm:

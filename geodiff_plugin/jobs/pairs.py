@@ -104,9 +104,9 @@ def start_many(options: DepthOptions, notify: Notify = silent) -> list[PairRef]:
     path = check_out(options.out) / SUMMARY
     is_table = path.is_file() and path.read_bytes().startswith(BEGINNING)
     if os.path.lexists(path) and not is_table:
-        hint = f"Choose another --out, or move that {SUMMARY}; the table of results has this name."
+        hint = f"Choose a different --out, or move that {SUMMARY}; the table of results has this name."
         got = f"{options.out / SUMMARY}, which is not the table of an earlier run"
-        bad_value("--out", f"a folder without {SUMMARY} of another program", got, hint)
+        bad_value("--out", f"a folder without a {SUMMARY} from a different program", got, hint)
     return refs
 
 
@@ -223,7 +223,7 @@ def _of_folders(options: DepthOptions) -> tuple[list[PairRef], Sequence[Finding]
         pairs = list(zip(lefts, rights, strict=True))  # im0_L.png, im0_R.png
         first, last = (f"{a.name} with {b.name}" for a, b in (pairs[0], pairs[-1]))
         sentence = (
-            f"No file names match between the folders, so images are paired in order: {first} to {last}."
+            f"No file names match between the folders, so images are paired by position: {first} to {last}."
         )
         return [PairRef(a.stem, a, b) for a, b in pairs], [Finding("pairs.in-order", sentence)]
     if unpaired := {path.stem for path in lefts} ^ set(of_stem):
@@ -260,7 +260,8 @@ def _frames(pairs: Sequence[tuple[int, int]], pattern: PairRef) -> list[PairRef]
 def _of_list(path: Path, right: Path | None) -> list[PairRef]:
     if right is not None:
         raise_input_error(
-            f"RIGHT ({right}) is given, but LEFT ({path.name}) is a list, which has both views of each pair."
+            f"RIGHT ({right}) was passed, but LEFT ({path.name}) is a list, which has both views of each "
+            "pair."
         )
     file = check_file(path, "LEFT", "a list of pairs")
     try:

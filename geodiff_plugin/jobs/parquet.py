@@ -93,12 +93,17 @@ class Store:
         system, folder = self.open()
         names = self._names()
         if names and JOB not in names:
-            bad_value("--out", "a new or empty folder, or one of an earlier run", self.uri, "Choose another.")
+            bad_value(
+                "--out",
+                "a new or empty folder, or one of an earlier run",
+                self.uri,
+                "Choose a different one.",
+            )
         if JOB in names and not options.overwrite:
             with system.open_input_stream(f"{folder}/{JOB}") as file:
                 made = json.loads(file.read())
             if changes := changed_options(options, made):
-                hint = "Choose another --out, or add --overwrite to repeat all pairs."
+                hint = "Choose a different --out, or add --overwrite to repeat all pairs."
                 bad_value("--out", "a folder of a run with the same options", ", ".join(changes), hint)
         system.create_dir(folder, recursive=True)
         for name in names:

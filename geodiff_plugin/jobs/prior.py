@@ -48,7 +48,7 @@ def load_quiet_prior(
     """Load a prior without guidance; only downloads show progress bars.
 
     Args:
-        name: ``--prior``: ``"bundled"``, a hub id or a folder.
+        name: ``--prior``: ``"bundled"``, a Hugging Face model ID or a folder.
         device: device of the prior.
         space: prediction space, overriding the prior's config.
         dtype: precision of its weights: ``"float32"``, ``"float16"`` or ``"bfloat16"``.

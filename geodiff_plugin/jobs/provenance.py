@@ -155,7 +155,7 @@ def _finished(out: Path) -> dict[str, str | None]:
 
 
 def _raise_mismatch(out: Path, differences: Sequence[str]) -> NoReturn:
-    hint = "Choose another --out, or add --overwrite to repeat all frames."
+    hint = "Choose a different --out, or add --overwrite to repeat all frames."
     bad_value(
         "--out",
         "a folder with frames of the same settings and inputs",

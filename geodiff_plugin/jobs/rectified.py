@@ -38,7 +38,7 @@ def select_rig(rig: Rig, images_01: Sequence[np.ndarray]) -> Rig:
     if taken_px > MAX_RESIDUAL_PX or rectified_px < MIN_RATIO * taken_px:
         return rig
     sentence = (
-        f"{rig.source} describes raw and rectified images. The given images are raw: matches lie "
+        f"{rig.source} describes raw and rectified images. These images are raw: matches lie "
         f"{taken_px:.1f} px off their epipolar lines, {rectified_px:.1f} px if they were rectified."
     )
     warn(Finding("calibration.unrectified", sentence))

@@ -144,7 +144,7 @@ def points_to_matches(points: Tensor, left: Camera, size_grid: tuple[int, int]) 
             "at least one in front of the left camera and inside its image",
             f"{excluded} of {len(z)} behind it or outside",
             "Points are in metres in the left camera's frame: x right, y down, z forward. Transform points "
-            "from another frame first.",
+            "from any other frame first.",
         )
     height, width = size_grid
     scale = uv.new_tensor([width / size[1], height / size[0]])

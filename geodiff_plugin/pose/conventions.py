@@ -112,7 +112,7 @@ def reported_convention(found: Convention) -> list[Finding]:
         sentence = (
             f"The matches fit the poses ({found.name}) only if the images are rotated by {found.turned_deg} "
             "degrees counter-clockwise relative to their cameras. Check whether the images were rotated "
-            "afterwards, and whether their stored orientation is the one that the poses and K assume."
+            "after capture, and whether their stored orientation is the one that the poses and K assume."
         )
         notes.append(Finding("capture.rotated", sentence))
     elif found.name != AS_GIVEN:

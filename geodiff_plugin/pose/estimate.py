@@ -74,8 +74,8 @@ NO_UNIT = Finding(
 
 LEARNED = Finding(
     "estimate.learned",
-    "SIFT found no pose for these images, so the poses come from learned matches (XFeat), which may be wrong "
-    "without any other symptom. Check the result, or take brighter, sharper images.",
+    "No pose could be estimated from SIFT features, so the poses come from learned matches (XFeat), which "
+    "may be wrong without any other symptom. Check the result, or take brighter, sharper images.",
 )
 #: Matches sparse features of the left image in the right ones.
 Matcher = Callable[[Sequence[GreyImage]], Tracks]
@@ -160,7 +160,7 @@ def estimate_poses(
 ) -> tuple[Tracks, list[EstimatedPose]]:
     """Estimate the poses of two or more images, with a first baseline of 1; returns inliers and poses.
 
-    ``matcher`` is used if SIFT finds no pose.
+    ``matcher`` is used if no pose can be estimated from SIFT features.
     """
     try:
         return _poses_of_tracks(sparse_tracks(views), OF_SIFT)
@@ -360,7 +360,9 @@ def find_scale(
     """
     given = [name for name, v in (("baseline", baseline_m), ("known length", known_length)) if v is not None]
     if len(given) > 1:
-        bad_value("scale", "given once", " and ".join(given), "Remove one; points may be given in addition.")
+        bad_value(
+            "scale", "specified once", " and ".join(given), "Remove one; points may be passed in addition."
+        )
     if baseline_m is not None:
         return Scale("baseline", baseline_m / float(np.linalg.norm(Ts[0, :3, 3])))
     fits = (np.nan_to_num(residuals_px(tracks, Ts), nan=0.0) < 1.5).all(0)

@@ -56,7 +56,7 @@ def prior_of(pipe: Any) -> DepthPrior:
         if isinstance(pipe, getattr(adapter, "pipeline_class", ())):
             return adapter(pipe)  # type: ignore[call-arg]
     expected = f"a pipeline with an adapter ({', '.join(PRIORS)})"
-    loaded = "Load a hub id or a folder with load_prior(name)."
+    loaded = "Load a Hugging Face model ID or a folder with load_prior(name)."
     written = "docs/how-to/extending.md shows how to write one."
     bad_type("pipe", expected, pipe, loaded if isinstance(pipe, str) else written)
 
@@ -131,8 +131,8 @@ def load_prior(
     """Load a pipeline that can be guided.
 
     Args:
-        name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``); or ``"map"``, whose call
-            takes the ``depth_map`` of another model.
+        name: ``"bundled"``, a folder, or a Hugging Face model ID (``prs-eth/marigold-depth-v1-1``); or
+            ``"map"``, whose call takes the ``depth_map`` of another model.
         device: device of the networks, CPU for ``None``.
         dtype: dtype of the networks.
         space: space in which the prior's map is affine, key of ``SPACES``; by default from the folder, or

@@ -104,11 +104,11 @@ def convert_prior(paths: Sequence[Path], part: str | None = None, space: str | N
         raise_input_error(f"--space applies to {MARIGOLD_V2} only: omit it for {paths[0]}.")
     source, target = paths[-2:]
     if os.path.lexists(target):
-        bad_value("DST", "a folder that does not exist yet", target, "Choose another or remove it.")
+        bad_value("DST", "a folder that does not exist yet", target, "Choose a different one or remove it.")
     try:
         unfinished = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     except OSError as error:
-        hint = f"Choose another path, or create the folder {target.parent} first."
+        hint = f"Choose a different path, or create the folder {target.parent} first."
         bad_value("DST", "a folder that can be created", f"{target} ({error.strerror})", hint)
     kind = MARIGOLD_V2 if layered else "folder"
     try:
@@ -233,7 +233,9 @@ def _write_depthfm(checkpoint: Mapping[str, Any], folder: Path, part: str | None
     check_weights(wanted - fitting.keys(), unexpected, "the checkpoint's state_dict")
     unet.load_state_dict(fitting)
     source = part or VAE_ID
-    expected = "a folder or hub id of Stable Diffusion 1.5, or of its VAE (the checkpoint has none)"
+    expected = (
+        "a folder or Hugging Face model ID of Stable Diffusion 1.5, or of its VAE (the checkpoint has none)"
+    )
     subfolder = "" if (Path(source) / "config.json").is_file() else "vae"
     with reading("--with", expected, repr(source), f"Download it once: hf download {VAE_ID}."):
         vae = AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
@@ -258,7 +260,7 @@ def _load_encoder(part: str | None) -> Dinov2Model:
     source = Path(part or "")
     config, weights = source / "config.json", source / "model.safetensors"
     expected = f"a folder of {ENCODER_ID}, the encoder that ppd.pth needs"
-    hint = f"Download it once: hf download {ENCODER_ID} --local-dir da2. ppd_moge.pth needs another one."
+    hint = f"Download it once: hf download {ENCODER_ID} --local-dir da2. ppd_moge.pth needs a different one."
     if not (config.is_file() and weights.is_file()):
         bad_value("--with", expected, part or "nothing", hint)
     with reading("--with", expected, str(source), hint):
@@ -292,7 +294,7 @@ def _write_ppd(checkpoint: Mapping[str, Any], folder: Path, part: str | None) ->
     encoder = _load_encoder(part)
     if encoder.config.hidden_size != dit.config.semantic_size:
         expected = f"{dit.config.semantic_size} wide, like the checkpoint's tokens"
-        got = f"{encoder.config.hidden_size} wide, another size of Depth Anything V2"
+        got = f"{encoder.config.hidden_size} wide, a different size of Depth Anything V2"
         bad_value("the encoder of --with", expected, got)
     PPDPipeline(dit, encoder, FlowMatchEulerDiscreteScheduler()).save_pretrained(folder)
     _write_card(

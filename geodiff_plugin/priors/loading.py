@@ -46,7 +46,7 @@ OTHER_VARIANTS = ["*.fp16.*safetensors", "*.bf16.*safetensors", "*.fp16-*.safete
 #: Libraries that ``model_index.json`` may name: diffusers, transformers, and this package's components.
 LIBRARIES = {"diffusers": diffusers, "transformers": transformers, components.__name__: components}
 
-HINT = "A file may be truncated or from another version. Save or download the folder again."
+HINT = "A file may be truncated or from a different version. Save or download the folder again."
 
 
 @contextmanager
@@ -135,9 +135,14 @@ def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | 
         return Path(name)
     if os.path.isfile(name):
         hint = "Pass its folder. Convert a downloaded checkpoint with `geodiff convert`."
-        bad_value("prior", "'bundled', a folder or a hub id", f"the file {name}", hint)
+        bad_value("prior", "'bundled', a folder or a Hugging Face model ID", f"the file {name}", hint)
     if name.count("/") > 1 or name.startswith((".", "/", "~")):
-        bad_value("prior", "'bundled', an existing folder, or a hub id", repr(name), "Check the path.")
+        bad_value(
+            "prior",
+            "'bundled', an existing folder, or a Hugging Face model ID",
+            repr(name),
+            "Check the path.",
+        )
     patterns = list(SMALL_FILES)
     ignored = None
     if weights and variant is None:
@@ -145,7 +150,7 @@ def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | 
         ignored = OTHER_VARIANTS
     elif weights:
         patterns += [f"*.{variant}.safetensors", f"*.{variant}-*.safetensors"]
-    expected = "'bundled', a folder, or a hub id that is cached or reachable"
+    expected = "'bundled', a folder, or a Hugging Face model ID that is cached or reachable"
     hint = "Download it once with `hf download ID`, pass a folder, or use --prior bundled."
     with reading("prior", expected, repr(name), hint):
         folder = snapshot_download(name, allow_patterns=patterns, ignore_patterns=ignored, **hub)
@@ -157,7 +162,7 @@ def check_weights(missing: Any, unexpected: Any, where: str) -> None:
     named = {"missing": sorted(map(str, missing)), "unexpected": sorted(map(str, unexpected))}
     parts = [f"{label}: {', '.join(keys)}" for label, keys in named.items() if keys]
     if parts:
-        hint = "These weights belong to another architecture, or the file is damaged."
+        hint = "These weights belong to a different architecture, or the file is damaged."
         bad_value(f"weights in {where}", "exactly the ones that its config requires", "; ".join(parts), hint)
 
 

@@ -122,7 +122,7 @@ def _as_list(given: Any) -> list[Tensor]:
     """Convert ``depth_map`` to maps ``(1, 1, h, w)`` float32 starting at 0, NaN where unknown."""
     if given is None:
         hint = "Use pipe(left, depth_map=array, guidance=...), or --prior-map FILE."
-        bad_value("depth_map", "given with the prior 'map'", "nothing", hint)
+        bad_value("depth_map", "passed to the prior 'map'", "nothing", hint)
     if isinstance(given, (np.ndarray, Tensor)):
         given = given[..., 0] if given.ndim == 3 and given.shape[-1] == 1 else given  # (H, W, 1)
         given = [given] if given.ndim == 2 else list(given)

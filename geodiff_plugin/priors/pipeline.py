@@ -396,7 +396,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         if not isinstance(latents, Tensor):
             bad_type("latents", "None or a torch.Tensor", latents)
         if generator is not None:
-            bad_value("latents and generator", "given one at a time", "both")
+            bad_value("latents and generator", "passed one at a time", "both")
         z = self.prepare_latents(condition, None)
         if latents.shape != z.shape:
             bad_value("latents", f"of shape {tuple(z.shape)}", f"shape {tuple(latents.shape)}")

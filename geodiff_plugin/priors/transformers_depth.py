@@ -301,7 +301,9 @@ class TransformersDepthPipeline(DirectMapPipeline):
         low, span = image_01.new_zeros(1), image_01.new_ones(1)
         if prompt_m is not None:
             if not self.takes_prompt:
-                bad_value("prompt_depth", "omitted with this model", "given", f"Only {PROMPTED} takes one.")
+                bad_value(
+                    "prompt_depth", "omitted with this model", "one passed", f"Only {PROMPTED} takes one."
+                )
             # Normalized to [0, 1], as the model itself does, but before half precision rounds the metres.
             prompt = prompt_m.to(image_01.device).float()
             low, high = prompt.amin((1, 2, 3), keepdim=True), prompt.amax((1, 2, 3), keepdim=True)

@@ -160,15 +160,20 @@ def _published(pipe: Any, latent: LatentGrid, scaling_factor: float | None) -> s
     for each in PUBLISHED:
         if (each.latent, each.scaling_factor) == (latent, scaling_factor):
             return each.hub_id
-    hint = f"No tiny autoencoder is published for {latent.channels} latent channels; pass a folder or hub id."
+    hint = (
+        f"No tiny autoencoder is published for {latent.channels} latent channels; pass a folder or a "
+        "Hugging Face model ID."
+    )
     bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(TINY), hint)
 
 
 @lru_cache(maxsize=1)
 def _loaded(name: str, dtype: torch.dtype, device: str) -> AutoencoderTiny:
     if not os.path.isdir(name) and (name.count("/") != 1 or name.startswith((".", "/", "~"))):
-        bad_value("decoder", f"{FULL!r}, {TINY!r}, an existing folder, or a hub id", repr(name))
-    expected = "a folder with an AutoencoderTiny, or a hub id that is cached or reachable"
+        bad_value(
+            "decoder", f"{FULL!r}, {TINY!r}, an existing folder, or a Hugging Face model ID", repr(name)
+        )
+    expected = "a folder with an AutoencoderTiny, or a Hugging Face model ID that is cached or reachable"
     hint = "Download it once with `hf download ID`, or pass a folder written by save_pretrained."
     with reading("decoder", expected, repr(name), hint):
         tiny = AutoencoderTiny.from_pretrained(name, dtype=dtype, use_safetensors=True)

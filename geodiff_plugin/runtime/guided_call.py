@@ -99,7 +99,7 @@ class GuidedCall(_Stock):
         """
         if guidance is None and (callback_on_step_end is not None or strict):
             name = "strict" if callback_on_step_end is None else "callback_on_step_end"
-            bad_value(name, "given only with guidance", "guidance=None")
+            bad_value(name, "passed only with guidance", "guidance=None")
         with PipelineLock(self, guidance is not None) as held:
             if self._guided_run is not None:
                 raise RuntimeError(

@@ -15,9 +15,10 @@ INCONSISTENT = FindingKind(
     "views.inconsistent",
     REASON,
     "The views are inconsistent",
-    cause="The axis or rotation of E is wrong, the images are unrectified or distorted, K is for another "
-    "image size, one image is mirrored, or the images show different scenes or times.",
-    hint="Check these causes in this order; overview.png shows where the views disagree.",
+    cause="E uses the wrong axis convention or has a wrong rotation, the images are unrectified or "
+    "distorted, K is for a different image size, one image is mirrored, or the images show different scenes "
+    "or times.",
+    hint="Check these causes in the order listed; overview.png shows where the views disagree.",
 )
 
 
@@ -63,8 +64,8 @@ class Agreement(Check[None]):
             numbers = [f"rank correlation with the prior is {fact.rank_correlation:.2f}"]
         yield Finding(
             INCONSISTENT,
-            f"The views are inconsistent ({', '.join(numbers)}). Check E, K, rectification, and mirrored or "
-            "wrong images.",
+            f"The views are inconsistent ({', '.join(numbers)}). Check E, K, rectification, and for mirrored "
+            "or wrong images.",
         )
 
 

@@ -19,17 +19,17 @@ ORDER = FindingKind(
     "depth.order",
     REASON,
     "Prior and matches disagree on the depth order",
-    cause="E, K or the order of the images is wrong, or the right image shows another scene.",
-    hint="Check these causes in this order.",
+    cause="E, K or the order of the images is wrong, or the right image shows a different scene.",
+    hint="Check these causes in the order listed.",
 )
 PRIOR_ORDER = FindingKind(
     "prior.order",
     REMARK,
-    "The prior inverts near and far, and the matches contradict it",
-    cause="The prior was not trained on such scenes; or the given map is for another image, rotated, or in "
-    "another space.",
-    hint="Check the map and its space (--space). Matched regions are unaffected; elsewhere the depth follows "
-    "the prior and has a low confidence.",
+    "According to the matches, the prior inverts near and far",
+    cause="The prior was not trained on scenes like this. Or the supplied prior map is for a different "
+    "image, is rotated, or is in a different prediction space.",
+    hint="Check the map and its prediction space (--space). Matched regions are unaffected; elsewhere the "
+    "depth follows the prior and has a low confidence.",
 )
 
 

@@ -29,7 +29,7 @@ RESIDUAL_TREND = FindingKind(
     "Epipolar residuals vary systematically across the image",
     cause="E has a wrong rotation, a rolling shutter sheared the right image, or lens distortion was not "
     "removed. The matches fit all of these equally well.",
-    hint="Check the rotation in E, and that the images are rectified with this calibration.",
+    hint="Check the rotation of E, and that the images are rectified with this calibration.",
 )
 
 #: Maximum epipolar distance of a match that is used, pixels.
@@ -96,7 +96,7 @@ class Distortion(Check[ResidualDistortion]):
 
 
 def _distorted(k1: float) -> Finding:
-    hint = "Rectify the images, or give the distortion coefficients."
+    hint = "Rectify the images, or pass the distortion coefficients."
     if k1 > 0:  # a telephoto lens, or a wide-angle lens whose distortion was removed twice
         hint = "The images may be undistorted twice; check whether they are rectified already."
     return Finding(

@@ -17,16 +17,17 @@ from geodiff_plugin.types import RejectedPose
 FEW_MATCHES = FindingKind(
     "pose.few-matches",
     REASON,
-    "Too few features match to confirm the refined or given pose",
-    cause="The given pose contradicts optical flow, and too few features match to check it reliably.",
-    hint="Give a more accurate pose, or use views with more texture or overlap.",
+    "There are too few feature matches to confirm either the refined or the given pose",
+    cause="The given pose contradicts optical flow, and there are too few feature matches to check it "
+    "reliably.",
+    hint="Provide a more accurate pose, or use views with more texture or overlap.",
 )
 KEPT = FindingKind(
     "pose.kept",
     WARNING,
-    "The given pose has an epipolar error above 1 px, and no nearby pose is better",
+    "The given pose has an epipolar error above 1 px, and no nearby pose is clearly better",
     cause="K, the distortion or the order of the views is wrong, or objects moved between the images.",
-    hint="Check the causes in the message, in that order.",
+    hint="Check the causes in the message in the order listed.",
 )
 REFINED = FindingKind(
     "pose.refined",
@@ -39,15 +40,15 @@ TOO_FAR = FindingKind(
     "pose.too-far",
     WARNING,
     "The best-fitting pose is too far from the given one and was not used",
-    cause="The given pose belongs to another pair, or uses another convention.",
+    cause="The given pose belongs to a different pair, or uses a different convention.",
     hint="Correct the pose, or estimate it (from_unposed_images, --estimate-pose).",
 )
 EPIPOLAR_ERROR = FindingKind(
     "pose.epipolar-error",
     REASON,
     "The epipolar error is above 4 px",
-    cause="The pair is not rectified, K is for other images, or E is for another pair.",
-    hint="Check these causes in this order.",
+    cause="The pair is not rectified, K is for different images, or E is for a different pair.",
+    hint="Check these causes in the order listed.",
 )
 RESIDUAL = FindingKind(
     "pose.residual",
@@ -58,8 +59,8 @@ RESIDUAL = FindingKind(
 )
 
 _CAUSES = (
-    "Likely causes: inaccurate poses (tracker, SLAM, drifted rig), moving objects, rolling shutter, lens "
-    "distortion, K for another size, wrong view order, world-to-camera poses."
+    "Likely causes: inaccurate poses (tracker, SLAM, drifted rig), moving objects, rolling shutter, "
+    "lens distortion, K for a different size, wrong view order, world-to-camera poses."
 )
 _DRIFT = (
     "Likely cause: the rig has drifted since calibration. Recalibrate it, or keep its calibration "
@@ -211,7 +212,7 @@ def _of_refinement(fact: Residuals) -> Iterator[Finding]:
         yield Finding(
             FEW_MATCHES,
             f"Only {fact.features} features match, but {MIN_MATCHES} are needed to check the pose. Optical "
-            f"flow gives a median epipolar error of {worst_px:.1f} px. Give a more accurate pose.",
+            f"flow implies a median epipolar error of {worst_px:.1f} px. Provide a more accurate pose.",
         )
 
 

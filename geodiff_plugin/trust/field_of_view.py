@@ -15,17 +15,17 @@ UNUSUAL = FindingKind(
     "camera.field-of-view",
     REMARK,
     "The field of view is unusual",
-    cause="K is for another image size, or the lens is a telephoto or fisheye lens.",
-    hint="Check K. Ignore the message if the lens has this field of view.",
+    cause="K is for a different image size, or the lens is a telephoto or fisheye lens.",
+    hint="Check K. Ignore this message if the lens has this field of view.",
 )
 UNCONFIRMED = FindingKind(
     "camera.unconfirmed-field-of-view",
     REASON,
     "The field of view is unusual, and K is not from a calibration file",
-    cause="The focal length is in millimetres or for another image size, or the lens is a telephoto or "
+    cause="The focal length is in millimetres or for a different image size, or the lens is a telephoto or "
     "fisheye lens.",
-    hint="Give fx in pixels. If it is correct, pass a calibration file (--calib, --K), or the depth range "
-    "(depth_range, --near, --far).",
+    hint="Specify fx in pixels. If it is correct, confirm it with a calibration file (--calib, --K), or by "
+    "setting the depth range of the scene (depth_range, --near, --far).",
 )
 
 
@@ -55,12 +55,13 @@ class FieldOfView(Check[ViewAngle]):
     def findings(cls, facts: FactSheet, earlier: Sequence[Finding]) -> Iterator[Finding]:
         fact = facts[cls]
         if fact and not cls.MIN_DEGREES <= fact.degrees <= cls.MAX_DEGREES:
-            unusual = f"K gives a field of view of {fact.degrees:.0f} degrees, which is unusual."
+            unusual = f"K implies a field of view of {fact.degrees:.0f} degrees, which is unusual."
             if facts.call.calibrated or SearchRange.confirms_unit(facts):
                 yield Finding(UNUSUAL, f"{unusual} Check that it is for this image size.")
             else:
                 yield Finding(
                     UNCONFIRMED,
                     f"{unusual} Check fx: in pixels it is millimetres * image width / sensor width. If it is "
-                    "correct, pass a calibration file (--calib, --K) or the depth range (--near, --far).",
+                    "correct, confirm it with a calibration file (--calib, --K) or the depth range (--near, "
+                    "--far).",
                 )

@@ -18,7 +18,7 @@ IDENTICAL = FindingKind(
     "views.identical",
     REASON,
     "The left and right images are identical",
-    cause="One file was given twice.",
+    cause="The same file was passed twice.",
     hint="Use two images from different viewpoints.",
     explains=("*",),
 )

@@ -21,35 +21,36 @@ OUTSIDE = FindingKind(
     "points.outside",
     WARNING,
     "Points outside the left image are ignored",
-    cause="The points cover a larger scene, or are in another camera's frame.",
-    hint="Give points in the left camera's frame, in metres.",
+    cause="The points cover a larger scene, or are in a different camera's frame.",
+    hint="Provide points in the left camera's frame, in metres.",
 )
 FACTOR = FindingKind(
     "points.factor",
     REASON,
     "Known and matched depths differ by a large factor",
-    cause="A unit, the baseline or K is wrong, or the points are in another frame.",
+    cause="A unit, the baseline or K is wrong, or the points are in the wrong frame.",
     hint="Check the unit of the points, the baseline and K.",
 )
 CONTRADICT = FindingKind(
     "points.contradict",
     REASON,
     "More than half of the known depths contradict the matches",
-    cause="The points are noisy, or from another scene or time.",
-    hint="Give their confidence (points_confidence, --points-confidence), or remove them.",
+    cause="The points are noisy, or from a different scene or time.",
+    hint="Specify their confidence (points_confidence, --points-confidence), or remove them.",
 )
 TOO_FEW = FindingKind(
     "points.too-few",
     REASON,
     "There are too few known depths to determine scale and shift",
     cause="Fewer than three points are in the image, and there is no matched second view.",
-    hint="Give at least three points.",
+    hint="Provide at least three points to determine scale and shift, and at least 50, spread over the "
+    "image, for a verdict.",
 )
 DIFFER = FindingKind(
     "points.differ",
     REMARK,
-    "Known and matched depths differ by a factor of up to 1.2",
-    cause="The baseline or K is inaccurate, or the points have a wrong unit or frame.",
+    "Known and matched depths differ by 8 to 20 %",
+    cause="The baseline or K is inaccurate, or the points are in the wrong unit or frame.",
     hint="Check the unit of the points, the baseline and K.",
 )
 SOME_CONTRADICT = FindingKind(
@@ -57,14 +58,14 @@ SOME_CONTRADICT = FindingKind(
     REMARK,
     "More than a quarter of the known depths contradict the matches",
     cause="The points are noisy, at edges, or on surfaces that only the depth sensor sees.",
-    hint="Give their confidence (points_confidence, --points-confidence), or remove them.",
+    hint="Specify their confidence (points_confidence, --points-confidence), or remove them.",
 )
 FEW = FindingKind(
     "points.few",
     REMARK,
     "There are too few known depths",
     cause="Fewer than three points are in the image.",
-    hint="Give at least three points.",
+    hint="Provide at least three points.",
 )
 
 #: Radius in pixels within which a point is compared with matches, because a point is rarely on a matched
@@ -208,14 +209,14 @@ def _contradict(kind: FindingKind, fact: Points) -> Finding:
     return Finding(
         kind,
         f"{100 * (fact.fraction_off or 0.0):.0f} % of the known depths contradict the matches, and the "
-        "result follows the known depths. Give --points-confidence (points_confidence), or remove wrong "
+        "result follows the known depths. Pass --points-confidence (points_confidence), or remove wrong "
         "points.",
     )
 
 
 def _few(count: int, alone: bool) -> Finding:
     message = (
-        f"image has only {count} known depth{'s' * (count > 1)}; give at least {KnownPoints.MIN_POINTS}."
+        f"image has only {count} known depth{'s' * (count > 1)}; provide at least {KnownPoints.MIN_POINTS}."
     )
     if alone:
         return Finding(TOO_FEW, f"Scale and shift are undetermined: the {message}")

@@ -21,16 +21,16 @@ SHORT = FindingKind(
     REASON,
     "The baseline is shorter than a millimetre",
     cause="The translation was divided by 1000 twice.",
-    hint="Give baselines and poses in metres. If the baseline is correct, give the depth range (depth_range, "
-    "--near, --far).",
+    hint="Specify baselines and poses in metres. If the baseline really is that short, set the depth range "
+    "of the scene to confirm it (depth_range, --near, --far).",
 )
 UNIT = FindingKind(
     "pose.unit",
     REASON,
     "Baseline and depth are implausibly large",
     cause="The baseline or the translation is in centimetres or millimetres.",
-    hint="Divide it by 100 or 1000. If the scene is that far away, give its depth range (depth_range, "
-    "--near, --far).",
+    hint="Divide it by 100 or 1000. If the scene really is that far away, set its depth range to confirm it "
+    "(depth_range, --near, --far).",
 )
 
 
@@ -92,9 +92,9 @@ class LengthUnits(Check[Lengths]):
         if 0 < fact.baseline_m < cls.MIN_BASELINE_M and not stated:
             yield Finding(
                 SHORT,
-                f"The baseline is {1000 * fact.baseline_m:.3g} mm, which is implausibly short. Give "
-                "baselines and poses in metres. If it is correct, give the depth range (depth_range, --near, "
-                "--far).",
+                f"The baseline is {1000 * fact.baseline_m:.3g} mm, which is implausibly short. Specify "
+                "baselines and poses in metres. If it is correct, set the depth range to confirm it "
+                "(depth_range, --near, --far).",
             )
         if (
             fact.scene_m is not None

@@ -15,8 +15,9 @@ LETTERBOX = FindingKind(
     "views.letterbox",
     REMARK,
     "The images are letterboxed",
-    cause="The images were padded to another aspect ratio.",
-    hint="Crop the bars and give the K of the cropped images. Ignore the message if K includes the bars.",
+    cause="The images were padded to a different aspect ratio.",
+    hint="Crop off the black bars and pass K for the cropped images. Ignore this message if K was calibrated "
+    "for the padded images.",
 )
 
 #: Maximum variation of grey levels within a bar, because compressed black is not exactly uniform.
@@ -52,8 +53,8 @@ class Letterbox(Check[LetterboxWidth]):
         if fact is not None:
             yield Finding(
                 LETTERBOX,
-                f"The images are letterboxed: each bar covers {100 * fact.width:.0f} % of the image. Check "
-                "that K is for the images with these bars.",
+                f"The images are letterboxed: each black bar covers {100 * fact.width:.0f} % of the image. "
+                "Check that K was calibrated for the padded images.",
             )
 
 

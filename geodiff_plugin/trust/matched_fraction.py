@@ -16,7 +16,7 @@ OVERLAP = FindingKind(
     WARNING,
     "The views have little overlap",
     cause="Only a small fraction of the left image is visible in a right view.",
-    hint="Choose views with an overlap of at least half of the image.",
+    hint="Choose views that overlap by at least half of the image.",
 )
 
 

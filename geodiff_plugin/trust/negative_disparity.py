@@ -18,14 +18,14 @@ NEGATIVE_DISPARITY = FindingKind(
     "Matches have negative disparity",
     cause="The right camera's cx or the rotation of E is wrong, the right image was cropped or stretched, or "
     "objects moved between the images.",
-    hint="Give the right camera's own K (K_right, --K-right, --cx-right); check E and the right image.",
+    hint="Pass the right camera's own K (K_right, --K-right, --cx-right); check E and the right image.",
 )
 CX_MISMATCH = FindingKind(
     "camera.cx-mismatch",
     REASON,
     "The right camera's cx seems to differ from the left camera's",
-    cause="Only one K was given for two parallel cameras, and it leads to negative disparities.",
-    hint="Give the right camera's calibrated matrix (K_right, --K-right) or cx (--cx-right). The difference "
+    cause="Only one K was passed for two parallel cameras, and it leads to negative disparities.",
+    hint="Pass the right camera's calibrated matrix (K_right, --K-right) or cx (--cx-right). The difference "
     "in the message is only a lower bound, so check one known distance afterwards. If the calibrated cx "
     "values are equal, check E and the right image.",
 )
@@ -103,7 +103,7 @@ def _cx_mismatch(fact: Negative) -> Finding:
     return Finding(
         CX_MISMATCH,
         f"{100 * fact.fraction:.0f} % of the matches have negative disparity: the right cx is off by at "
-        f"least {fact.px:.0f} px, possibly more. Give the calibrated K_right or --cx-right, then check one "
+        f"least {fact.px:.0f} px, possibly more. Pass the calibrated K_right or --cx-right, then check one "
         "known distance.",
     )
 

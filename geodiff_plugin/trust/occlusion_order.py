@@ -25,8 +25,8 @@ FAR_OCCLUDES = FindingKind(
     "depth.occlusion",
     REASON,
     "The occlusion order is inverted",
-    cause="The cameras have different principal points, and the views are swapped or both are mirrored or "
-    "upside down.",
+    cause="The views are swapped, or both are mirrored or upside down. This is checked only if the cameras' "
+    "principal points differ.",
     hint="Swap the images, or restore their original orientation.",
 )
 

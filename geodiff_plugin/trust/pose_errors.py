@@ -22,16 +22,16 @@ OPENGL = FindingKind(
     "pose.opengl",
     REASON,
     "The pose seems to use OpenGL axes",
-    cause="OpenGL and Blender have y up and z backward.",
-    hint="Give diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1).",
+    cause="In OpenGL and Blender, y points up and z points backward.",
+    hint="Pass diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1).",
     explains=NEGATIVE_DISPARITY,
 )
 OPENGL_INVERSE = FindingKind(
     "pose.opengl-inverse",
     REASON,
     "The pose seems to be world-to-camera in OpenGL axes",
-    cause="OpenGL and Blender have y up and z backward, and E is inverted.",
-    hint="Give inv(diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1)).",
+    cause="In OpenGL and Blender, y points up and z points backward, and E is inverted.",
+    hint="Pass inv(diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1)).",
     explains=NEGATIVE_DISPARITY,
 )
 TRANSPOSED = FindingKind(
@@ -54,22 +54,23 @@ VERTICAL = FindingKind(
     "pose.vertical",
     REASON,
     "The baseline seems to be along y, not along x",
-    cause="The cameras are mounted one above the other, and only the length of the baseline is given.",
-    hint="Give the pose with its translation along y (E, --E).",
+    cause="The cameras are mounted one above the other, but only the length of the baseline was given, so it "
+    "was assumed to be along x.",
+    hint="Pass the pose with its translation along y (E, --E).",
     explains=NEGATIVE_DISPARITY,
 )
 SWAPPED_K = FindingKind(
     "camera.swapped",
     REASON,
     "The camera matrices seem to be swapped",
-    cause="K was given as (K_right, K_left).",
-    hint="Give K as (K_left, K_right).",
+    cause="K was passed as (K_right, K_left).",
+    hint="Pass K as (K_left, K_right).",
     explains=NEGATIVE_DISPARITY,
 )
 SCALED_K = FindingKind(
     "camera.scaled",
     REASON,
-    "K seems to be for another image size",
+    "K seems to be for a different image size",
     cause="The images were resized, and K was not scaled.",
     hint="Scale K as the message describes.",
     explains=NEGATIVE_DISPARITY,
@@ -77,8 +78,8 @@ SCALED_K = FindingKind(
 SCALED_FOCAL = FindingKind(
     "camera.focal-scaled",
     REASON,
-    "The focal lengths seem to be for another image size",
-    cause="The images were resized, and only the principal point of K was adapted.",
+    "The focal lengths seem to be for a different image size",
+    cause="The images were resized, and only the principal point in K was adjusted.",
     hint="Scale fx and fy as the message describes.",
     explains=NEGATIVE_DISPARITY,
 )
@@ -86,9 +87,9 @@ ORDER_INVERTED = FindingKind(
     "depth.inverted-order",
     REASON,
     "The depth order is inverted",
-    cause="Left and right are swapped, the baseline has the wrong sign, E is world-to-camera, or a prior map "
-    "is in another space.",
-    hint="Swap the images, flip the sign, invert E, or state the space of the map (--space).",
+    cause="Left and right are swapped, the baseline has the wrong sign, E is world-to-camera, or the prior "
+    "map is in a different prediction space (for example disparity instead of depth).",
+    hint="Swap the images, flip the sign, invert E, or specify the map's prediction space (--space).",
     explains=("depth.order", *NEGATIVE_DISPARITY),
 )
 
@@ -178,7 +179,7 @@ def inverted_order() -> Finding:
 
 
 _AXES = (
-    "E seems to use OpenGL or Blender axes (y up, z backward), so depth is wrong. Give "
+    "E seems to use OpenGL or Blender axes (y up, z backward), so depth is wrong. Pass "
     "diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1)."
 )
 _MESSAGES = {
@@ -188,8 +189,8 @@ _MESSAGES = {
     MIXED: "E seems to mix a camera-to-world rotation with a world-to-camera translation, so depth is wrong. "
     "Take both from the camera-to-world pose.",
     VERTICAL: "The baseline seems to be along the y axis, not the x axis: the cameras are mounted one above "
-    "the other. Give E with the translation (0, {factor:+g} * baseline, 0) in metres.",
-    SWAPPED_K: "K seems to be given as (K_right, K_left), so depth is wrong. Swap the two matrices.",
+    "the other. Pass E with the translation (0, {factor:+g} * baseline, 0) in metres.",
+    SWAPPED_K: "K seems to be passed as (K_right, K_left), so depth is wrong. Swap the two matrices.",
     SCALED_K: "K seems to be for images of {size:.3g} times this width and height, so depth is wrong. "
     "With s = {factor:g} use fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy.",
     SCALED_FOCAL: "The focal lengths seem to be for images of {size:.3g} times this width and height, so "

@@ -17,16 +17,17 @@ SCALE = FindingKind(
     "scale.uncertain",
     REASON,
     "The scale of the refined pose is uncertain",
-    cause="The baseline was not measured, and the given baseline and scene depth lead to different scales of "
-    "the refined pose.",
-    hint="Give the measured baseline (--baseline, measured_baseline=True), or at least three known points.",
+    cause="The baseline is not declared as measured, and it implies a different scale for the refined pose "
+    "than the scene depth does.",
+    hint="Specify the measured baseline (--baseline, measured_baseline=True), or provide at least three "
+    "known points.",
 )
 UNCONSTRAINED = FindingKind(
     "pose.unconstrained",
     REASON,
     "The matches do not constrain the pose",
-    cause="The baseline is short or the matches are few, so rotation and translation are ambiguous.",
-    hint="Give a more accurate pose, or use views with a longer baseline.",
+    cause="The baseline is too short, or there are too few matches, to separate rotation from translation.",
+    hint="Provide a more accurate pose, or use views with a longer baseline.",
 )
 
 
@@ -87,15 +88,15 @@ class PoseUncertainty(Check[Uncertainty]):
             if fact.refined:
                 yield Finding(
                     UNCONSTRAINED,
-                    "The matches do not constrain the pose: another equally good pose changes depth by "
-                    f"{100 * math.expm1(fact.depth_change):.0f} % (median). Give a more accurate pose.",
+                    "The matches do not constrain the pose: a different, equally good pose changes depth by "
+                    f"{100 * math.expm1(fact.depth_change):.0f} % (median). Provide a more accurate pose.",
                 )
         elif scale <= MAX_SCALE_SPREAD and not fixed and cls._together(scale, fact) > cls.MAX_TOGETHER:
             yield Finding(
                 UNCONSTRAINED,
-                f"The refined pose is uncertain: its scale may be off by {100 * scale:.0f} %, and another "
-                f"equally good pose changes depth by {100 * math.expm1(fact.depth_change):.0f} % (median). "
-                "Check K and E.",
+                f"The refined pose is uncertain: its scale may be off by {100 * scale:.0f} %, and a "
+                f"different, equally good pose changes depth by {100 * math.expm1(fact.depth_change):.0f} % "
+                "(median). Check K and E.",
             )
 
     @classmethod
@@ -115,6 +116,6 @@ def _scale_uncertain(scale: float, given_px: float | None) -> Finding:
     misses = "" if given_px is None else f"E has an epipolar error of {given_px:.0f} px; check E. "
     return Finding(
         SCALE,
-        f"{misses}The scale of the refined pose is uncertain by {100 * min(scale, 1):.0f} %. Give the "
-        f"measured baseline (--baseline), or at least {KnownPoints.MIN_POINTS} known points.",
+        f"{misses}The scale of the refined pose is uncertain by {100 * min(scale, 1):.0f} %. Specify the "
+        f"measured baseline (--baseline), or provide at least {KnownPoints.MIN_POINTS} known points.",
     )

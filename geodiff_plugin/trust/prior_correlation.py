@@ -17,9 +17,9 @@ ORDER_OF_POINTS = FindingKind(
     "depth.order-points",
     REASON,
     "Prior and known depths disagree on the depth order",
-    cause="The points are not depths in metres in the left camera's frame, or the space of the prior is "
-    "wrong.",
-    hint="Check the frame and the unit of the points, and the space of the prior.",
+    cause="The points are not depths in metres in the left camera's frame, or the prediction space of the "
+    "prior is wrong.",
+    hint="Check the frame and the unit of the points, and the prediction space of the prior (--space).",
 )
 
 

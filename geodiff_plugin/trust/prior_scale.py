@@ -20,16 +20,17 @@ UNIT = FindingKind(
     REASON,
     "The depth differs from the metric prior by a factor of more than 20",
     cause="The baseline is not in metres.",
-    hint="Check the unit of the baseline. If it is correct, give the depth range of the scene (depth_range, "
-    "--near, --far), or use another prior.",
+    hint="Check the unit of the baseline. If it really is in metres, set the depth range of the scene to "
+    "confirm it (depth_range, --near, --far), or use a different prior.",
 )
 METRES = FindingKind(
     "prior.metres",
     REMARK,
     "The depth differs from the metric prior by a large factor",
-    cause="The baseline is not in metres, K is for another image size, or the prior was not trained on such "
+    cause="The baseline is not in metres, K is for a different image size, or the prior was not trained on "
+    "scenes like this.",
+    hint="Check the baseline and K. Ignore this message if the prior was trained on different kinds of "
     "scenes.",
-    hint="Check the baseline and K. Ignore the message if the prior was trained on other scenes.",
 )
 
 

@@ -75,14 +75,15 @@ NOT_TRUSTED = FindingKind(
     "verdict.not-trusted",
     WARNING,
     "Do not trust this depth",
-    cause="At least one reason was found; the message lists all of them.",
-    hint="Look up each reason in this table.",
+    cause="At least one reason not to trust it was found; the message lists all of them.",
+    hint="Look up each reason in the tables above.",
 )
 NOT_JUDGED = FindingKind(
     "verdict.not-judged",
     WARNING,
-    "This depth was not judged",
-    cause="There are neither matches from a second view nor enough known depths across the image.",
+    "This depth could not be verified",
+    cause="There is nothing to check it against: no matches from a second view, and too few known depths "
+    "spread over the image.",
     hint="Add an overlapping second view, or at least 50 known points spread over the image.",
 )
 KINDS = FINDINGS | {

@@ -17,18 +17,19 @@ REPEATED = FindingKind(
     "views.repeated-pattern",
     REMARK,
     "Part of the image is a repeated pattern",
-    cause="A fence, bars, tiles, blinds or shelves look the same one period further along the epipolar line.",
-    hint="Filter by confidence there, or rotate the rig so that the pattern does not repeat along the "
-    "baseline.",
+    cause="A fence, tiles, blinds or shelves look the same when shifted by one period along the epipolar "
+    "line.",
+    hint="Discard low-confidence pixels there, or rotate the rig so that the pattern does not repeat along "
+    "the baseline.",
 )
 UNDECIDED = FindingKind(
     "depth.repeated-pattern",
     REASON,
     "A repeated pattern makes the depth ambiguous",
-    cause="The pattern matches at several depths, and neither the prior nor the surroundings decide which is "
-    "right.",
-    hint="Rotate the rig so that the pattern does not repeat along the baseline, show more of the scene "
-    "without the pattern, use a better prior, or give known points.",
+    cause="The pattern matches at several depths, and neither the prior nor the surroundings resolve which "
+    "one is correct.",
+    hint="Rotate the rig so that the pattern does not repeat along the baseline, include more of the scene "
+    "beyond the pattern, use a better prior, or provide known points.",
 )
 
 
@@ -78,11 +79,12 @@ class RepeatedPattern(Check[Repetition]):
             yield Finding(
                 UNDECIDED,
                 f"{100 * fact.undecided:.0f} % of the image is a repeated pattern that matches at several "
-                "depths, so its depth may be off by whole periods. Rotate the rig, or give known points.",
+                "depths, so its depth may be off by whole periods. Rotate the rig, or provide known points.",
             )
         elif fact.fraction > cls.MIN_FRACTION:
             yield Finding(
                 REPEATED,
-                f"{100 * fact.fraction:.0f} % of the image is a repeated pattern. Its depth was chosen "
-                "with the prior and the surrounding depth, and is less certain. Filter by confidence there.",
+                f"{100 * fact.fraction:.0f} % of the image is a repeated pattern. Its depth was chosen with "
+                "the prior and the surrounding depth, and is less certain. Discard low-confidence pixels "
+                "there.",
             )

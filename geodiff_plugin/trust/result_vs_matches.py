@@ -18,9 +18,9 @@ OFF = FindingKind(
     "depth.off-matches",
     REASON,
     "The depth differs from the matched depths",
-    cause="The scale or shift was not found.",
-    hint="Enable match fitting (fit_matches) if it is disabled; otherwise use another prior, or give known "
-    "points.",
+    cause="No scale and shift could be found that align the prior with the matches.",
+    hint="Enable match fitting (fit_matches) if it is disabled; otherwise use a different prior, or provide "
+    "known points.",
 )
 
 
@@ -62,5 +62,5 @@ class ResultVsMatches(Check[Deviation]):
             yield Finding(
                 OFF,
                 f"The depth differs by {100 * math.expm1(fact.log_deviation):.0f} % (median) from the "
-                "matched depths. Use another prior, or give known points.",
+                "matched depths. Use a different prior, or provide known points.",
             )

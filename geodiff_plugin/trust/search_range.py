@@ -16,7 +16,7 @@ from geodiff_plugin.trust.stages import ResultStage
 RANGE = FindingKind(
     "depth.range",
     REASON,
-    "The scene extends beyond the given depth range",
+    "The scene extends beyond the specified depth range",
     cause="depth_range (--near, --far) is too narrow.",
     hint="Widen or omit it.",
 )

@@ -17,7 +17,7 @@ SHIFTED = FindingKind(
     REASON,
     "All matches have the same depth",
     cause="The right image is a shifted copy of the left one, or the scene is a fronto-parallel wall.",
-    hint="Use a second image from another viewpoint.",
+    hint="Use a second image from a different viewpoint.",
 )
 
 
@@ -60,6 +60,6 @@ class ShiftedCopy(Check[DepthRange]):
         if fact and fact.log_ratio < cls.MAX_LOG_RATIO and fact.planes < cls.MAX_PLANES:
             yield Finding(
                 SHIFTED,
-                "All matches have the same depth: the right image may be a shifted copy. Use another "
+                "All matches have the same depth: the right image may be a shifted copy. Use a different "
                 "image, unless the scene is a flat wall.",
             )

@@ -21,8 +21,8 @@ TEARING = FindingKind(
     "views.tearing",
     REASON,
     "An image shows frame tearing",
-    cause="A frame was read out while the next one replaced it, or lines were lost.",
-    hint="Take another frame; synchronise readout and exposure.",
+    cause="A frame was read while the next one was overwriting it, or image rows were lost.",
+    hint="Capture a new frame; synchronise readout and exposure.",
 )
 
 #: Maximum shift as a fraction of the width.
@@ -88,7 +88,7 @@ class Tearing(Check[Tear]):
         yield Finding(
             TEARING,
             f"The {image} is torn: all rows from {fact.row} on are shifted {abs(fact.px)} px to the "
-            f"{'right' if fact.px > 0 else 'left'}, so depth is wrong there. Take another frame.",
+            f"{'right' if fact.px > 0 else 'left'}, so depth is wrong there. Capture a new frame.",
         )
 
 

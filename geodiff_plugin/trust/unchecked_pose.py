@@ -16,7 +16,7 @@ UNCHECKED = FindingKind(
     "pose.unchecked",
     REASON,
     "The pose could not be checked",
-    cause="Too few features match to check the pose, and the depth does not confirm it either.",
+    cause="There are too few feature matches to check the pose, and the depth does not confirm it either.",
     hint="Use views with more texture or overlap. If the pose is exact, set pose='given' (--set pose=given).",
 )
 
@@ -39,6 +39,6 @@ class UncheckedPose(Check[None]):
         if not (KnownPoints.agree(facts) or (MatchedFraction.well_matched(facts) and followed)):
             yield Finding(
                 UNCHECKED,
-                "The pose could not be checked: too few features match. Use views with more texture or, if "
-                "the pose is exact, set pose='given' (--set pose=given).",
+                "The pose could not be checked: there are too few feature matches. Use views with more "
+                "texture or, if the pose is exact, set pose='given' (--set pose=given).",
             )

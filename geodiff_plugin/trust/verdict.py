@@ -11,7 +11,7 @@ from geodiff_plugin.trust.matched_fraction import MatchedFraction
 from geodiff_plugin.trust.registry import CHECKS, NOT_JUDGED, NOT_TRUSTED
 
 #: Why a depth is not judged.
-UNTESTED = "there are neither matches from a second view nor enough known depths across the image"
+UNTESTED = "there are no matches from a second view, and too few known depths spread over the image"
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def judge(facts: FactSheet) -> Verdict:
     reasons = any(finding.is_reason for finding in findings)
     if reasons or judged:
         return Verdict("not trusted" if reasons else "trusted", findings, facts)
-    untested = Finding(NOT_JUDGED, f"This depth was not judged: {UNTESTED}.")
+    untested = Finding(NOT_JUDGED, f"This depth could not be verified: {UNTESTED}.")
     return Verdict("not judged", (*findings, untested), facts)
 
 

@@ -177,7 +177,10 @@ def test_asked_to_end_it_clears_away_what_it_began(finished, tmp_path):
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=300)
     assert process.returncode == 143
-    assert "geodiff: terminated. Run the same command again to resume." in said and "Traceback" not in said
+    assert (
+        "geodiff: terminated. Run the same command again to resume or restart." in said
+        and "Traceback" not in said
+    )
     left = [path.name for path in out.rglob("*") if PARTIAL in path.name or path.name == FOLDER_LOCK]
     assert not left
 

@@ -46,7 +46,7 @@ def test_points_without_a_right_image_and_a_cloud_of_what_is_believed(geodiff, c
     answer = geodiff(*alone, "--strict", "--out", "strict")
     assert (
         answer.code == 2
-        and "Scale and shift are undetermined: the image has only 1 known depth; give at least 3."
+        and "Scale and shift are undetermined: the image has only 1 known depth; provide at least 3."
         in answer.err
     )
     assert not Path("strict").exists()

@@ -90,7 +90,7 @@ def test_folders_go_by_name_else_by_order_in_which_numbers_count(tmp_path, textu
         path.rename(path.with_stem(f"{path.stem}_R"))
     names = [ref.right.name for ref in find_pairs(options, reported.append)]
     assert names == ["f1_R.png", "f2_R.png", "f10_R.png"]
-    assert "in order: f1.png with f1_R.png to f10.png with f10_R.png." in reported[0]
+    assert "by position: f1.png with f1_R.png to f10.png with f10_R.png." in reported[0]
 
 
 def test_lists_by_comma_or_tab(tmp_path):
@@ -216,7 +216,7 @@ def test_results_of_other_options_or_files_are_not_taken_for_these(geodiff, fini
     (finished / "out" / "b" / "report.json").unlink()  # so that there is something to do
     before = contents(finished / "out")
     answer = geodiff(*COMMAND, "--seed", 1)
-    assert answer.code == 2 and "a, made with --seed 0 instead of 1. Choose another" in answer.err
+    assert answer.code == 2 and "a, made with --seed 0 instead of 1. Choose a different" in answer.err
     for changed in (Path("right", "a.png"), Path("calib.txt")):
         whole = changed.read_bytes()
         changed.write_bytes(whole + b"\n")

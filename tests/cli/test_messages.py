@@ -52,7 +52,7 @@ def test_a_defect_keeps_its_traceback_and_ctrl_c_is_a_line(monkeypatch, geodiff,
     monkeypatch.setattr("geodiff_plugin.jobs.prior.load_quiet_prior", stop)
     answer = geodiff(*pair_files.command)
     assert (answer.code, answer.out) == (130, "")
-    assert answer.err == "geodiff: interrupted. Run the same command again to resume.\n"
+    assert answer.err == "geodiff: interrupted. Run the same command again to resume or restart.\n"
     assert sorted(pair_files.folder.iterdir()) == before
 
 
@@ -66,7 +66,7 @@ def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
     camera = ["--fx", 60, "--fy", 60, "--cx", 31.5, "--cy", 23.5, "--baseline", 120]
     *warned, assumed, last = geodiff(*pair_files.images, *camera).err.splitlines()
     assert assumed.startswith("assumed: The right camera's cx") and last.endswith(
-        "Run the same command again to resume."
+        "Run the same command again to resume or restart."
     )
     words = [("LEFT", "alpha"), ("RIGHT", "EXIF"), ("millimetres", "")]
     for line, reported in zip(warned, words, strict=True):

@@ -5,8 +5,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING
 from pathlib import Path
 
+import pytest
+
 from geodiff_plugin.cli.app import COMMANDS
+from geodiff_plugin.cli.eval import LIST
 from geodiff_plugin.evaluation.options import COMMANDS as EVALUATIONS
+from geodiff_plugin.jobs import CaptureOptions, DepthOptions, LiveOptions
 from geodiff_plugin.options import SECTIONS, Command
 from geodiff_plugin.settings import DEFAULT_SECTION, Setting, settings_of
 from tests.pages import check_generated
@@ -78,7 +82,9 @@ def _evaluations(commands: Mapping[str, Command]) -> list[str]:
             shared.setdefault(row, []).append(f"`{name}`")
             order[row] = SECTIONS.index(option.section)
     for row in sorted(shared, key=lambda row: order[row]):
-        names = "all" if len(shared[row]) == len(commands) else ", ".join(shared[row])
+        missing = [f"`{name}`" for name in commands if f"`{name}`" not in shared[row]]
+        names = ", ".join(shared[row]) if missing else "all"
+        names = "all but `list`" if missing == ["`list`"] else names
         lines.append(f"| {' | '.join(row)} | {names} |")
     return [*lines, ""]
 
@@ -87,12 +93,21 @@ def _tables() -> str:
     """Markdown of every command."""
     plain = {name: command for name, command in COMMANDS.items() if command.options is not None}
     lines = [line for name, command in plain.items() for line in _command(name, command)]
-    return "\n".join(["", *lines, *_evaluations(EVALUATIONS)])
+    return "\n".join(["", *lines, *_evaluations(EVALUATIONS | {"list": LIST})])
 
 
 def test_the_page_of_options_is_up_to_date():
     """``GEODIFF_WRITE=1 pytest tests/cli/test_options_page.py`` regenerates its tables."""
     check_generated(PAGE, BEGIN, _tables(), END)
+
+
+@pytest.mark.parametrize("record", [DepthOptions, CaptureOptions, LiveOptions])
+def test_the_name_of_a_field_follows_from_its_option(record):
+    """In lower case, with underscores in place of dashes, except for the one that the page names."""
+    options = [option for option in settings_of(record).values() if not option.is_argument]
+    named = {option.name: option.flag.removeprefix("--").replace("-", "_").lower() for option in options}
+    assert {name for name, flag in named.items() if name != flag} <= {"parameter"}
+    assert named.get("parameter", "set") == "set"
 
 
 def test_every_option_of_depth_has_one_row():

@@ -146,7 +146,7 @@ def test_a_cut_off_file_is_a_sentence_that_names_it_or_a_whole_rig(sample, tmp_p
 
 #: A sample, what is replaced in its last file (or in all, for "all:"), by what, and the message.
 REFUSALS = [
-    ("middlebury", "baseline=120.0\n", "", "no 'baseline'. It may be from another program"),
+    ("middlebury", "baseline=120.0\n", "", "no 'baseline'. It may be from a different program"),
     ("middlebury", "line=120.0\nwidth=640\nheight=480\nndisp=64\n", "", "no 'baseline'. The file seems "
                                                                         "truncated"),
     ("middlebury", "baseline=120.0", "baseline=0", "baseline must be positive"),
@@ -159,8 +159,8 @@ REFUSALS = [
      "R, T must be rigid.*rotation"),
     ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nM2", "[ 0.1, 0.0, 0.0, 0.0 ]\nM2", "of the left .*rectify"),
     ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nR", "[ 1, 2, 3 ]\nR", "right camera must be 4, 5, 8, 12, 14 co"),
-    ("opencv", "D2:", "dist_of_right:", r"both cameras \(D1, D2\); got dist_of_right. Rename"),
-    ("opencv", "0.0, 0.0, 0.0, 0.0 ]\nR", "0.1, 0.0, 0.0, 0.0 ]\nD1: 3\nR", r"\(D1, D2\); got one of them"),
+    ("opencv", "D2:", "dist_of_right:", r"both cameras \(D1, D2\); got dist_of_right. Name"),
+    ("opencv", "0.0, 0.0, 0.0, 0.0 ]\nR", "0.1, 0.0, 0.0, 0.0 ]\nD1: 3\nR", "got for one of them"),
     ("opencv", "D2:", "mtxL:", "K1 must be unique; got m1, mtxl, which differ"),
     ("booster", "<opencv_storage>", '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage>', "entities"),
     ("booster", "</opencv_storage>", "", "must be a whole Booster xml"),
@@ -169,7 +169,7 @@ REFUSALS = [
     ("realsense_printed", 'To  "Infrared 2"', 'To  "Depth"', "rotation of the extrinsics must be 9"),
     ("oak", '"toCameraSocket": 2', '"toCameraSocket": -1', "a chain of links from socket 1 to 2"),
     ("ros", "  - 91.0\n", "  - 175.0\n", "the same in both. These are of single cameras"),
-    ("ros", "projection_matrix:", "projektion:", "projection_matrix must be given in both files; got none"),
+    ("ros", "projection_matrix:", "projektion:", "matrix must be specified in both files; got none"),
     ("all:ros_echo", "p: [", "p: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0] # [", "got zeros: the camera is not"),
     ("kalibr", "camera_model: pinhole", "camera_model: omni", "lens model of the left camera .* got omni"),
     ("orb_slam_rectified", "ThDepth: 35", "DepthMapFactor: 5000", "got a camera .* with a depth sensor"),
@@ -186,8 +186,8 @@ REFUSALS = [
     ("vins", "PINHOLE", "MEI", "model_type must be one of PINHOLE, KANNALA_BRANDT; got MEI"),
     ("matlab", '"mm"', '"furlongs"', "WorldUnits must be one of .*got furlongs"),
     ("matlab", '"TranslationOfCamera2"', '"Shift"', "no 'TranslationOfCamera2'. It may be from "
-                                                    "another program"),
-    ("cityscapes", '"baseline"', '"base"', "got no 'baseline'. It may be from another program"),
+                                                    "a different program"),
+    ("cityscapes", '"baseline"', '"base"', "got no 'baseline'. It may be from a different program"),
     ("named", '"camera_matrix_left"', '"left_lens"', "P1, P2, or with K1, K2, R, T; got no K1"),
     ("okvis", "radialtangential", "fov", "lens model of the left camera .* got fov"),
     ("svo", "type: pinhole", "type: atan", "lens model of the left camera .* got atan"),
@@ -195,9 +195,9 @@ REFUSALS = [
     ("airslam", "distortion_type: 1", "distortion_type: 7", "distortion_type must be one of 0, 1, 2; got 7"),
     ("anipose", "[metadata]", "[third]\nmatrix = []\n[metadata]", r"of 0 \(cam0\), 1 \(cam1\), 2 \(third"),
     ("mrcal", "OPENCV4", "SPLINED_STEREOGRAPHIC_order=3", "must be one of .*mrcal-convert-lensmodel"),
-    ("mrcal", "[ ", "[ __import__('os'), ", "a camera model of mrcal; got another text"),
+    ("mrcal", "[ ", "[ __import__('os'), ", "a camera model of mrcal; got a different text"),
     ("argoverse", "_rect", "_raw", "rectified stereo pair; got image_raw_stereo_front_left"),
-    ("ros_ini", "projection\n", "projections\n", "projection_matrix must be given in both files; got none"),
+    ("ros_ini", "projection\n", "projections\n", "matrix must be specified in both files; got none"),
     ("nerf", '"k1"', '"k4": 0.1, "k1"', "k4 must be zero for OPENCV; got .0.1."),
 ]  # fmt: skip
 
@@ -229,7 +229,7 @@ def test_a_wrong_entry_is_named(tmp_path, sample, old, new, said):
             {"image_names": ("left.jpg", "left.jpg")},
             "two images of the file.* got ./rig/left.jpg for both",
         ),
-        ("nerf", {"image_names": None}, "image_names must be given"),
+        ("nerf", {"image_names": None}, "image_names must be specified"),
     ],
 )
 def test_a_wrong_choice_is_named(tmp_path, sample, given_, said):

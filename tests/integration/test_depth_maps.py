@@ -68,7 +68,7 @@ def test_several_images_each_with_a_map_of_its_size():
 @pytest.mark.parametrize(
     ("depth_map", "said"),
     [
-        (None, "depth_map must be given with the prior 'map'"),
+        (None, "depth_map must be passed to the prior 'map'"),
         (np.full((9, 9), np.nan), "two different finite values"),
         (np.ones((9, 9)), "two different finite values"),
         (np.arange(18.0).reshape(2, 3, 3), "one map .* for each of 1 images"),

@@ -302,7 +302,7 @@ def test_bad_arguments_of_a_call_are_named(guided):
     with pytest.raises(TypeError, match="guidance must be a GeometryGuidance"):
         guided.pipe(pair.left, guidance={"right": pair.right})
     larger = np.diag([3.0, 3.0, 1.0]) @ pair.K
-    with pytest.raises(ValueError, match="another resolution"):
+    with pytest.raises(ValueError, match="a different resolution"):
         guided_call(guided.pipe, pair, GeometryGuidance(pair.right, (larger, pair.K), pair.E))
     with pytest.raises(TypeError, match="adapter"):
         enable_geometry_guidance(object())

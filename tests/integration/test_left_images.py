@@ -18,7 +18,7 @@ FLOATS = LEFT.astype(np.float32) / 255
 WITH_NAN = np.where(np.arange(64)[None, :, None] == 4, np.float32(np.nan), FLOATS)
 ALPHA = np.dstack([LEFT, np.full(LEFT.shape[:2], 7, np.uint8)])
 PALETTE = Image.fromarray(LEFT).convert("P")
-TOLD = ["image has an alpha channel: pixels with alpha 0 are not valid."]
+TOLD = ["image has an alpha channel: fully transparent pixels (alpha 0) are treated as invalid."]
 
 
 @pytest.mark.parametrize(

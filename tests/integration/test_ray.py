@@ -450,7 +450,7 @@ def test_options_of_a_pair_are_those_of_a_run_without_ray(few):
     from geodiff_plugin.jobs.cluster import _alone
 
     plain = DepthOptions(left=few.folder / "left", right=few.folder / "right", out=few.folder / "out")
-    assert _alone(replace(plain, engine="ray", layout="folders", workers=2, gpus=0.5)) == plain
+    assert _alone(replace(plain, engine="ray", format="folders", workers=2, gpus=0.5)) == plain
 
 
 def test_masks_of_many_pairs_are_those_of_one_process(few, cluster, tmp_path):

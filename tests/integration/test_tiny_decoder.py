@@ -91,10 +91,10 @@ def test_what_cannot_decode_is_rejected(guided, tmp_path, monkeypatch):
     )
     (tmp_path / "empty").mkdir()
     for decoder, sentence in (
-        ("tiny", r"decoder must be 'full' with .*folder or hub id"),
+        ("tiny", r"decoder must be 'full' with .*folder or a Hugging Face model ID"),
         (tiny_folder(tmp_path / "flux", channels=16), r"latent \(4 channels, 2 px a cell\).*16 channels"),
         (tiny_folder(tmp_path / "deep", stages=4), r"2 px a cell\).*8 px a cell"),
-        (str(tmp_path / "nothing"), "an existing folder, or a hub id"),
+        (str(tmp_path / "nothing"), "an existing folder, or a Hugging Face model ID"),
         (str(tmp_path / "empty"), "a folder with an AutoencoderTiny"),
         ("nobody/no-such-decoder", r"reachable; got 'nobody/no-such-decoder' \(We couldn't connect"),
         (3, "decoder"),

@@ -105,7 +105,7 @@ def test_a_mask_an_alpha_channel_and_a_black_border_agree(make_oracle):
     pair = pair_of(False)
     left, right = masked(pair, CIRCLE, np.zeros_like(pair.left))
     given = call(make_oracle, pair, left, right, mask=CIRCLE, right_mask=Image.fromarray(CIRCLE))
-    with pytest.warns(UserWarning, match="pixels with alpha 0 are not valid"):
+    with pytest.warns(UserWarning, match="transparent pixels .alpha 0. are treated as invalid"):
         alpha = [np.dstack([image, 255 * CIRCLE.astype(np.uint8)]) for image in (left, right)]
         by_alpha = call(make_oracle, pair, *alpha)
     assert np.array_equal(by_alpha.prediction, given.prediction)

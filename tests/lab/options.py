@@ -66,13 +66,13 @@ class StrengthOptions(OutOptions):
     """Options of ``strength``: the effect of prior quality."""
 
     data: tuple[Path, ...] = folder_of(
-        "Folder of data sets, or the name of a registered data set; repeatable.", default=()
+        "Folder of datasets, or the name of a known dataset; repeatable.", default=()
     )
-    limit: int | None = count_of(None, "Maximum number of pairs of each --data, from the first.")
+    limit: int | None = count_of(None, "Maximum number of pairs, taken from the start of each --data.")
     strengths: tuple[str, ...] = some_of(STRENGTHS)
     space: str = setting(
         "disparity",
-        "Space in which the prior is affine-invariant: disparity, depth or log.",
+        "Quantity that the prior predicts up to scale and shift: disparity, depth or log.",
         choices=SPACES[:3],
     )
     follow: float = setting(
@@ -90,12 +90,12 @@ class PriorMapsOptions(EvalOptions):
     """Options of ``prior-maps``: guided calls with depth maps that have errors."""
 
     data: tuple[Path, ...] = folder_of(
-        "Folder of data sets, or the name of a registered data set; repeatable.", default=()
+        "Folder of datasets, or the name of a known dataset; repeatable.", default=()
     )
     scenes: tuple[str, ...] = listed(
         (), "Only pairs whose names contain one of these words, separated by commas."
     )
-    limit: int | None = count_of(None, "Maximum number of pairs of each --data, from the first.")
+    limit: int | None = count_of(None, "Maximum number of pairs, taken from the start of each --data.")
     errors: tuple[str, ...] = some_of(MAP_ERRORS)
     maps: tuple[str, ...] = listed(
         (), "Folders of further maps, DIR or KIND:DIR as in the method prior-map, separated by commas."
@@ -122,7 +122,7 @@ class SurfacesOptions:
         MISSING, "Folder with planes.json, data sets or synthetic-plain:N; repeatable."
     )
     prior: str = setting("bundled", "Prior to guide.")
-    seed: int = setting(0, "Random seed of the noise.")
+    seed: int = setting(0, "Seed for the random noise.")
     out: Path | None = setting(None, "Folder for one figure per pair.")
     without: str | None = setting(None, "Stage to omit: median or planar.", choices=("median", "planar"))
 

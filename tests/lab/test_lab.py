@@ -45,7 +45,7 @@ def test_every_experiment_has_help_and_is_not_in_the_wheel(name):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("trust", "--data must be given, or --rendered above 0"),
+        ("trust", "--data must be set, or --rendered above 0"),
         ("trust --rendered 1 --width 16", "--width must be between 64"),
         ("trust --rendered 1 --kinds bent", "--kinds must be one of K-0.67"),
         ("trust --rendered 1 --kinds unrelated", "without 'unrelated' if there is only one pair"),

@@ -353,7 +353,7 @@ def _table(source: str, records: Sequence[Record]) -> Table:
 def _real_and_rendered(options: TrustOptions) -> dict[str, list[SampleRef]]:
     """Return the first pairs of ``--data``, and ``--rendered`` rendered ones."""
     if options.data is None and not options.rendered:
-        bad_value("--data", "given, or --rendered above 0", "neither")
+        bad_value("--data", "set, or --rendered above 0", "neither")
     real = [] if options.data is None else some_pairs(find_pairs(options.data), options.data)
     of_size = f"synthetic:{options.rendered}@{options.width}x{options.width * 3 // 4}"
     rendered = find_pairs(of_size, ["synthetic"]) if options.rendered else []

@@ -135,7 +135,7 @@ def _tables() -> str:
             "",
             f"## {heading}",
             "",
-            "| code | meaning | cause | what to do |",
+            "| code | meaning | likely cause | what to do |",
             "| --- | --- | --- | --- |",
         ]
         for code, kind in KINDS.items():

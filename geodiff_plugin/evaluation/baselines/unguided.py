@@ -125,7 +125,7 @@ STEREO_METHODS = (
 def hf_method(name: str) -> Method:
     """Return the method of a depth checkpoint of transformers; relative ones are scored aligned only."""
     if not name:
-        bad_value("methods", "hf:MODEL with a hub id or a folder", "'hf:'")
+        bad_value("methods", "hf:MODEL with a Hugging Face model ID or a folder", "'hf:'")
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
         left_01 = as_image_01(sample.left, "left")[None].to(settings.device)

@@ -82,12 +82,12 @@ def some_pairs(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()
     """Return samples whose label contains one of ``scenes``; ``ValueError`` for none, or equal labels."""
     kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
     if not kept:
-        found = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
+        found = ", ".join(ref.label for ref in refs) or "no sample of any known dataset"
         wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
         hint = (
             "For your own pair, create a folder with left.png, right.png, calib.txt and depth.npy. "
-            "geodiff eval list states "
-            "how to obtain public data sets; docs/how-to/extending.md describes how to add others."
+            "geodiff eval list states how to obtain public datasets; docs/how-to/extending.md describes "
+            "how to add others."
         )
         bad_value("DIR (--data)", f"a folder with a sample{wanted}", f"{data} with {found}", hint)
     # E.g. two resolutions of a set, whose records would be indistinguishable.

@@ -255,7 +255,7 @@ def _sources_of(path: Path) -> dict[int, list[int]]:
             sources[reference] = [int(source) for source in row[1 : 1 + 2 * int(row[0]) : 2]]
     except (IndexError, ValueError):
         layout = "a pair.txt (count, then 'id' and 'n id score ...' lines per view)"
-        bad_value(str(path), layout, "another format")
+        bad_value(str(path), layout, "a different format")
     return sources
 
 

@@ -1,16 +1,16 @@
-"""Pairs that the constants of the package were chosen on, and pairs that nothing was tuned on."""
+"""Pairs that were used to tune the defaults, and held-out pairs that nothing was tuned on."""
 
 from __future__ import annotations
 
 import tomllib
 from pathlib import Path
 
-#: Split -> data set -> names of its samples, from ``splits.toml``.
+#: Split -> dataset -> names of its samples, from ``splits.toml``.
 SPLITS: dict[str, dict[str, list[str]]] = tomllib.loads(
     Path(__file__).with_name("splits.toml").read_text(encoding="utf-8")
 )
 #: What the pairs of each split are, for tables.
-TITLES = {"tuned": "that constants were tuned on", "unseen": "that nothing was tuned on"}
+TITLES = {"tuned": "used to tune the defaults", "unseen": "held out"}
 
 
 def split_of(dataset: str, sample: str) -> str | None:

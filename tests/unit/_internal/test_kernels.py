@@ -139,11 +139,11 @@ def test_triton_interprets_by_its_environment_variable(value, interpreted, monke
 @pytest.mark.parametrize(
     ("triton", "interpreted", "cuda", "hip", "words"),
     [
-        (False, True, True, None, "plain torch: Triton is not installed"),
+        (False, True, True, None, "plain PyTorch: Triton is not installed"),
         (True, True, True, None, "Triton's interpreter on the CPU"),
         (True, True, False, None, "Triton's interpreter on the CPU"),
-        (True, False, False, None, "plain torch: kernels need CUDA"),
-        (True, False, True, "6.2", "plain torch: kernels need CUDA"),
+        (True, False, False, None, "plain PyTorch: kernels need CUDA"),
+        (True, False, True, "6.2", "plain PyTorch: kernels need CUDA"),
         (True, False, True, None, "Triton on CUDA, compiled on the first call on a machine"),
     ],
 )

@@ -784,7 +784,7 @@ def test_one_length_scales_all_and_without_one_there_are_no_metres(way, model, t
     assert np.median(depth / ground_truth) == pytest.approx(1 if way else 0.5, rel=0.02)
     cloud = (tmp_path / "out/cloud.ply").read_bytes()[:200].decode("latin1")
     texts = [summary(report, options.out), cloud, capsys.readouterr().err]
-    texts = [text.replace("for metres give", "") for text in texts]  # how to get them
+    texts = [text.replace("for metres pass", "") for text in texts]  # how to get them
     assert any(" m " in text or "metres" in text for text in texts) is bool(way)
     assert report["unit"] == json.loads((tmp_path / "out/f04/report.json").read_text())["unit"]
     assert report["unit"] == ("m" if way else None)

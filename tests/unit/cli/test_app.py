@@ -86,7 +86,7 @@ def test_assumed_pairing_is_reported_unless_quiet(pair, called, capsys):
     for path in Path("right").iterdir():
         path.rename(path.with_name(f"r{path.name}"))
     assert run("depth", "left", "right", *CAMERA) == 0
-    assert "paired in order" in capsys.readouterr().err
+    assert "paired by position" in capsys.readouterr().err
     assert run("depth", "left", "right", *CAMERA, "--quiet") == 0
     assert capsys.readouterr().err == ""
 
@@ -115,7 +115,7 @@ def test_a_bag_is_recognised_by_its_name(pair, called):
     Path("run.mcap").write_bytes(b"bag")
     assert run("depth", "run.mcap", "--left-topic", "/a", "--right-topic", "/b", "--tolerance", "0.1") == 0
     ((where, (options,), _),) = called
-    assert where == "cli.run.run_bag" and (options.topic_left, options.tolerance) == ("/a", 0.1)
+    assert where == "cli.run.run_bag" and (options.left_topic, options.tolerance) == ("/a", 0.1)
 
 
 def test_the_demo_runs_on_the_bundled_pairs(tmp_path, monkeypatch, called):

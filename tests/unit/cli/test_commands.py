@@ -76,10 +76,10 @@ def test_what_is_not_typed_is_the_default_of_its_field(typed):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--count", "2.5"], "--count must be an integer; got '2.5'. Give only the number"),
+        (["--count", "2.5"], "--count must be an integer; got '2.5'. Enter only the number"),
         (["--count", "x"], "--count must be an integer; got 'x'."),
         (["-p", "0,12"], "--part must be a number; got '0,12'. Use a decimal point: 0.12."),
-        (["-p", "3m"], "--part must be a number; got '3m'. Give only the number; --help states its unit."),
+        (["-p", "3m"], "--part must be a number; got '3m'. Enter only the number; --help states its unit."),
         (["--count", "10"], "--count must be between 1 and 9; got 10"),
         (["--names", "a,d"], "--names must be one of a, b, c; got 'd'"),
         (["--numbers", "1,x"], "--numbers must be comma-separated integers; got '1,x'."),
@@ -137,8 +137,12 @@ def test_all_choices_together_are_called_all():
     ("error", "code", "said"),
     [
         (InputError("it is torn"), 2, "geodiff: it is torn\n"),
-        (KeyboardInterrupt(), 130, "geodiff: interrupted. Run the same command again to resume.\n"),
-        (Terminated(), 143, "geodiff: terminated. Run the same command again to resume.\n"),
+        (
+            KeyboardInterrupt(),
+            130,
+            "geodiff: interrupted. Run the same command again to resume or restart.\n",
+        ),
+        (Terminated(), 143, "geodiff: terminated. Run the same command again to resume or restart.\n"),
         (MemoryError(), 2, "geodiff: out of memory. Downscale the images"),
         (RuntimeError("CUDA out of memory"), 2, "geodiff: out of memory."),
     ],

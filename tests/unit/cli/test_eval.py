@@ -1,4 +1,4 @@
-"""What ``geodiff eval`` prints of its pages, and the list of data sets and methods."""
+"""What ``geodiff eval`` prints of its pages, and the list of datasets and methods."""
 
 import json
 import re
@@ -158,7 +158,7 @@ def test_the_list_shows_what_exists_and_how_to_get_the_rest(monkeypatch, capsys,
     assert asked == [tmp_path] * 4 and "the simplest" not in text and "Nothing else" not in text
     assert run("list") == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert "one no --data given Get one." in text and len(asked) == 4
+    assert "one no --data set Get one." in text and len(asked) == 4
     assert "made any number of samples" in text
 
 
@@ -223,11 +223,11 @@ def test_pairs_continues_after_a_broken_sample_reports_it_at_the_end_and_retries
         ("pairs DATA --sample 3", "--sample must be at most 2"),
         ("pairs DATA --scenes three", "a sample with three in its name"),
         ("pairs TWICE --methods sgbm", "with several middlebury2014/one"),
-        ("poses", "--data must be given, or --exact"),
+        ("poses", "--data must be set, or --exact"),
         *((f"poses --data DATA --perturb {text}", "--perturb") for text in ("1.5", "1..2,0.1", "99,0")),
         ("poses --data DATA --drift 0.3,99", "--drift"),
         ("table1 --data EMPTY", r"--data must be a folder with the data of table1; .* https?://"),
-        ("table2", r"--data must be given; got nothing. Booster: .*https?://"),
+        ("table2", r"--data must be set; got nothing. Booster: .*https?://"),
     ],
 )
 def test_bad_options_are_named(data, tmp_path, words, said):

@@ -93,9 +93,9 @@ def test_a_capture_is_summed_up_by_the_median_of_its_frames_and_what_is_doubted(
     line = summary(report, Path("out"))
     assert line == "3 of 4 frames, median depth 3.75 m; NOT TRUSTED: f2, f3 (f2: E is wrong.) -> out/"
     line = summary(report | {"not_trusted": ["f3"]}, Path("out"))
-    assert "(f3: there are neither matches from a second view" in line
+    assert "(f3: there are no matches from a second view" in line
     line = summary(report | {"unit": None, "not_trusted": []}, Path("out"))
-    assert "median depth 3.75 pose units (for metres give --known-length" in line
+    assert "median depth 3.75 pose units (for metres pass --known-length" in line
     assert "NOT TRUSTED" not in line
     assert (
         summary({"frames": FRAMES[1:2], "unit": "m", "not_trusted": []}, Path("o")) == "0 of 1 frames -> o/"

@@ -536,9 +536,7 @@ def test_no_sample_and_two_of_one_name_are_rejected():
         ValueError, match=r"a folder with a sample with cave in its name; got f with d/room0, d/yard0"
     ):
         datasets.some_pairs(REFS, Path("f"), ("cave",))
-    with pytest.raises(
-        ValueError, match="a folder with a sample; got f with no sample of any known data set"
-    ):
+    with pytest.raises(ValueError, match="a folder with a sample; got f with no sample of any known dataset"):
         datasets.some_pairs([], Path("f"))
     with pytest.raises(ValueError, match="one sample of each name; got f with several d/yard3"):
         datasets.some_pairs([*REFS, REFS[7]], Path("f"))

@@ -319,7 +319,7 @@ def test_the_ablation_shows_both_presets_changed(there, compared):
 @pytest.mark.parametrize(
     ("name", "data", "words"),
     [
-        ("table2", None, "--data must be given; got nothing. Booster: booster_gt.zip"),
+        ("table2", None, "--data must be set; got nothing. Booster: booster_gt.zip"),
         (
             "table2",
             "here",

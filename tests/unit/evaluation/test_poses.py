@@ -164,7 +164,7 @@ def test_no_drift_drifts_no_pair_and_the_limit_is_of_real_pairs(known, tmp_path)
     assert {"AbsRel of 3 real pairs, two views", "AbsRel of 2 pairs, poses perturbed"} <= set(tables[0])
     assert not any("drifted" in title for title in tables[0]) and any("drifted" in t for t in tables[1])
     assert set(tables[2]) == {"AbsRel of 2 pairs, poses perturbed"}
-    with pytest.raises(ValueError, match="--data must be given, or --exact; got neither"):
+    with pytest.raises(ValueError, match="--data must be set, or --exact; got neither"):
         poses.run_poses("poses", PosesOptions(out=tmp_path))
 
 

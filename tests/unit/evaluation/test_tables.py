@@ -224,7 +224,7 @@ def test_pairs_have_a_row_each_and_means_of_all_and_of_each_kind():
     assert versus.title.startswith("guided against")
     titles = [table.title for table in rest]
     assert titles[:3] == [f"All metrics, {g}" for g in ("3 pairs", "2 rectified pairs", "1 posed pair")]
-    benchmarks = [f"Metrics of the data sets' benchmarks, {kind} pairs" for kind in ("rectified", "posed")]
+    benchmarks = [f"Metrics of the datasets' benchmarks, {kind} pairs" for kind in ("rectified", "posed")]
     assert titles[3:] == [*benchmarks, *DETAILS, "Confidence by decile", "Risk and coverage"]
     assert [row[1] for row in rest[1].rows] == ["2", "2", "2"]
     assert not any("against" in t.title for t in tables.pairs_tables(records[3:]))
@@ -369,13 +369,13 @@ def test_each_split_has_a_table_with_mean_and_median_of_each_kind_of_pairs():
     records += [scored("middlebury2003", name, "guided", e) for name, e in (("cones", 0.3), ("teddy", 0.5))]
     records += [scored("folder", "mine", "guided", 7.0)]
     tuned, unseen = tables.split_tables(records)
-    assert tuned.title == "4 pairs that constants were tuned on"
+    assert tuned.title == "4 pairs used to tune the defaults"
     assert tuned.groups == (("", 1), ("4 pairs", 2), ("3 rectified pairs", 2), ("1 posed pair", 2))
     assert tuned.rows == (
         ("guided", "0.350", "0.350", "0.300", "0.200", "0.500", "0.500"),
         ("SGBM + fill", "0.600 (3 of 4)", "0.400", "0.600", "0.400", "-", "-"),
     )
-    assert unseen.title == "2 pairs that nothing was tuned on"
+    assert unseen.title == "2 pairs held out"
     assert unseen.rows == (("guided", "0.400", "0.400"),)
     assert tables.split_tables([scored("folder", "mine", "guided", 7.0)]) == []
     assert [t.title for t in tables.pairs_tables([r | other_scores() for r in records])[:2]] == [

@@ -580,7 +580,7 @@ def test_points_of_either_form():
     ).inputs  # whole metres typed by hand
     np.testing.assert_array_equal(typed.points.numpy(), [[0.0, 0.0, 2.0], [1.0, 0.0, 3.0]])
     for points, hint in (
-        ([[0, 0, 2]], "Metres as integers are truncated: give floats"),
+        ([[0, 0, 2]], "Metres as integers are truncated: pass floats"),
         (np.full(SIZE_GUIDANCE, 2), "1000 for millimetres"),
     ):
         with pytest.raises(InputError, match=f"points must be metres as floats; got dtype .*{hint}"):
@@ -591,7 +591,7 @@ def test_points_of_either_form():
     ("changes", "error", "message"),
     [
         ({"K": "calib.txt"}, TypeError, "K must be"),
-        ({"K": K_OFF}, ValueError, "another resolution"),
+        ({"K": K_OFF}, ValueError, "a different resolution"),
         ({"E": put(E, (0, 0), 2.0)}, ValueError, "rigid"),
         ({"right": RIGHT_GUIDANCE.astype(np.float32)}, ValueError, "right"),
         ({"right": None}, ValueError, "right must be an image, or None together with points"),
@@ -606,7 +606,7 @@ def test_points_of_either_form():
         (
             {"right": [RIGHT_GUIDANCE, None], "E": [E, None], "points": [POINTS_GUIDANCE] * 2},
             ValueError,
-            "right must be given",
+            "right must be passed",
         ),
         ({"left_size": "64x48"}, TypeError, "left_size must be"),
         ({"unit": "mm"}, ValueError, "unit must be 'm' or None"),
@@ -640,7 +640,7 @@ def test_bad_input_names_the_argument(changes, error, message):
 @pytest.mark.parametrize(
     ("fx", "fy", "cx", "cy", "words"),
     [
-        (120, 120, 63.5, 47.5, "another resolution"),
+        (120, 120, 63.5, 47.5, "a different resolution"),
         (120, 120, 47.5, 35.5, "an image 1.5 times the size"),
         (60, 600, 31.5, 23.5, "pixels are usually square"),
         (60, 60, 38, 17, None),  # of a rig with converging axes

@@ -125,7 +125,7 @@ def test_one_right_image_serves_all_lists_of_points():
 
 ERRORS = [
     ({"right": None}, "right must be an image, or None together with points; got None without points"),
-    ({"confidence": np.ones(5)}, "points_confidence must be given with points; got no points"),
+    ({"confidence": np.ones(5)}, "points_confidence must be passed together with points; got no points"),
     ({"right": []}, "right must be an image or a list with one image per left image; got an empty list"),
     (
         {"right": [IMAGES[0]] * 2, "K": [KS[0]] * 3},
@@ -133,11 +133,11 @@ ERRORS = [
     ),
     (
         {"right": [IMAGES[0]] * 2, "points": [POINTS[0], None]},
-        "points must be given for every left image or for none; got None for 1",
+        "points must be passed for every left image or for none; got None for 1",
     ),
     (
         {"right": [IMAGES[0], None], "K": KS[0], "E": [ES[1], None], "points": POINTS[0]},
-        "right must be given for every left image or for none; got None for 1",
+        "right must be passed for every left image or for none; got None for 1",
     ),
     ({"right": None, "points": POINTS[0]}, "E must be None without a right view; got a pose. Points are in"),
     (
@@ -462,7 +462,7 @@ def test_right_images_and_points_are_given_for_every_left_image_or_for_none(name
     if name == "right":
         holes["E"] = [None if i in missing else each for i, each in enumerate(whole["E"])]
     if len(missing) < 3:
-        expected = "given for every left image or for none"
+        expected = "passed for every left image or for none"
         check_error(lambda: read(**whole | holes), name, expected, f"None for {missing[0]}")
         return
     found = read(**whole | holes)

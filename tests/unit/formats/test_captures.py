@@ -140,7 +140,7 @@ def test_frames_of_a_video_have_their_size_and_need_a_camera(read, tmp_path):
     found = read([replace(each, camera=RawCamera(K, (64, 40))) for each in made])
     np.testing.assert_array_equal(found.frames[1].camera.K, K)
     assert found.findings == []
-    with pytest.raises(InputError, match=r"K must be given by --K or --fov; got none. A video has no focal"):
+    with pytest.raises(InputError, match=r"K must be set by --K or --fov; got none. A video has no focal"):
         read(made)
 
 

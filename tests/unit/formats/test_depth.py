@@ -152,7 +152,7 @@ def test_disparities_are_those_of_projected_points():
     turned[:2, :2] = [[0.99, -0.14], [0.14, 0.99]]
     for bad in (turned, np.linalg.inv(cameras.E), cameras.E + 0.01 * np.eye(4, k=2)):
         with pytest.raises(
-            InputError, match="a submission must be of a rectified pair; got a pair with another"
+            InputError, match="a submission must be of a rectified pair; got a pair with a different"
         ):
             disparity_of_depth(depth_m, cameras.K_left, cameras.K_right, bad)
 

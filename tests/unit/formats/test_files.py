@@ -243,7 +243,7 @@ def test_arrays_of_real_numbers_alone_are_read_and_nothing_is_unpickled(tmp_path
     with pytest.raises(InputError, match="pickled objects, which are never loaded"):
         read_npy(path, "K", "numbers")
     path.write_bytes(b"1 2 3")
-    with pytest.raises(InputError, match="it is of another format"):
+    with pytest.raises(InputError, match="it is in a different format"):
         read_npy(path, "K", "numbers")
 
 
@@ -423,7 +423,7 @@ NO_FILE = ("view", "an image")
             "a.npy",
             b"not numpy's",
             lambda p: read_npy(p, *NO_FILE),
-            (*NO_FILE, "{}, which numpy cannot load (it is of another format)", "numpy.save"),
+            (*NO_FILE, "{}, which numpy cannot load (it is in a different format)", "numpy.save"),
         ),
         (
             "bool.npy",

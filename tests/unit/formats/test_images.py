@@ -93,7 +93,7 @@ def test_without_a_focal_length_and_the_density_of_the_sensor_there_is_no_k(miss
         if value is not None:
             image.getexif().get_ifd(0x8769)[TAGS[missing]] = value
         with pytest.raises(
-            InputError, match="K of left must be given; got no focal length in its EXIF. Pass K"
+            InputError, match="K of left must be specified; got no focal length in its EXIF. Pass K"
         ):
             intrinsics_from_exif(image, "left")
 
@@ -326,7 +326,7 @@ def test_wrong_channels_and_axes_are_reported_with_a_hint():
         with pytest.raises(InputError, match=said):
             as_image_01(value, "left")
     four = np.concatenate([PIXELS, PIXELS[..., :1]], axis=-1)
-    with pytest.warns(UserWarning, match="left has an alpha channel: pixels with alpha 0"):
+    with pytest.warns(UserWarning, match="left has an alpha channel: fully transparent pixels"):
         np.testing.assert_allclose(
             as_image_01(four, "left").numpy().transpose(1, 2, 0), PIXELS / 255, atol=1e-6
         )
@@ -414,7 +414,7 @@ def test_a_warning_points_at_the_line_that_gave_the_image():
         ),
         (
             lambda p: intrinsics_from_exif(with_exif((400, 300)), "LEFT"),
-            ("K of LEFT", "given", "no focal length in its EXIF", "Pass K (--K)"),
+            ("K of LEFT", "specified", "no focal length in its EXIF", "Pass K (--K)"),
         ),
     ],
 )
@@ -481,7 +481,11 @@ def test_other_modes_become_rgb_and_alpha_is_dropped(tmp_path, image, expected, 
     assert read.shape == (H, W, 3) and read.min() >= 0 and read.max() <= 1
     if expected is not None:
         np.testing.assert_allclose(read, np.broadcast_to(expected, read.shape), atol=1e-6)
-    assert said == ["left has an alpha channel: pixels with alpha 0 are not valid."] * alpha == heard(image)
+    assert (
+        said
+        == ["left has an alpha channel: fully transparent pixels (alpha 0) are treated as invalid."] * alpha
+        == heard(image)
+    )
     assert len(read_image(saved(tmp_path, PIL.convert("P"), transparency=0))[1]) == 1
 
 

@@ -286,7 +286,7 @@ def test_unit_suffixes_of_names_are_applied(unit, factor):
 
 def test_distortion_under_unknown_names_is_rejected():
     sentence = (
-        r"\Athe lens distortion must be given for both cameras \(D1, D2\); got {}\. "
+        r"\Athe lens distortion must be specified for both cameras \(D1, D2\); got {}\. "
         r"Name lens .* differently\.\Z"
     )
     entries = CAMERAS | POSE

@@ -346,7 +346,7 @@ def entered(manager):
                 "--out",
                 "a folder without inputs of the run",
                 "{0}/taken, which holds {0}/taken/a",
-                "another",
+                "a different one",
             ),
         ),
         (

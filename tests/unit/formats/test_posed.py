@@ -68,7 +68,7 @@ def test_anipose_poses_are_world_to_camera(above, form):
     assert_is_the_pair(FORMATS["anipose"].read((fisheye,), CHOSEN), lens=4, model="fisheye")
     with pytest.raises(
         InputError,
-        match=r"\Acameras must be given, two of 0 \(cam_0\), 1 \(view 1\), 2 \(view 2\); "
+        match=r"\Acameras must be specified, two of 0 \(cam_0\), 1 \(view 1\), 2 \(view 2\); "
         r"got none\. Pass --cameras LEFT,RIGHT\.\Z",
     ):
         FORMATS["anipose"].read((anipose(THREE, (above, form)),), CameraChoice())
@@ -165,7 +165,7 @@ def test_mrcal_models_with_twelve_coefficients_are_read_and_others_rejected():
             FORMATS["mrcal"].read((repr(other), repr(model | change)), CameraChoice())
     for text in ("[1, 2]", "{'a': open('x')}", "{", "1" * 5000 + "+"):
         with pytest.raises(
-            InputError, match=r"\Athe file must be a camera model of mrcal; got another text\. The"
+            InputError, match=r"\Athe file must be a camera model of mrcal; got a different text\. The"
         ):
             FORMATS["mrcal"].read((text, text), CameraChoice())
 

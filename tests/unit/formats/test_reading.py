@@ -91,7 +91,7 @@ def test_unknown_and_mixed_formats_are_rejected():
     with pytest.raises(
         UnknownFormatError,
         match=r"\Acalibration must be in a known format \(middlebury, .*named\); "
-        r"got b\.txt, in another format\. Check the file, or pass",
+        r"got b\.txt, in a different format\. Check the file, or pass",
     ):
         reading._format_of({Path("a.txt"): SAMPLES["kalibr"][0], Path("b.txt"): "some words\n"})
     two = {Path("a.txt"): SAMPLES["mvsnet"][0], Path("b.txt"): SAMPLES["euroc"][1]}
@@ -257,7 +257,7 @@ def test_referenced_files_are_read_from_the_same_folder(tmp_path):
             (
                 "calibration",
                 "in a known format (",
-                "{}/words.txt, in another format",
+                "{}/words.txt, in a different format",
                 "Check the file, or pass",
             ),
         ),

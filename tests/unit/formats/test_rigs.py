@@ -99,7 +99,7 @@ def test_input_errors_pass_through_with_the_file_name_in_front():
         raise InputFileError("the disk")
     sentence = r"FILE must be a whole x; got other entries\. "
     with (
-        refused(rf"{sentence}Check that it is the right kind of file\."),
+        refused(rf"{sentence}Check that it is the correct kind of file\."),
         rigs.reading_file("FILE", "x", "whole\n"),
     ):
         raise IndexError("3")
@@ -297,7 +297,7 @@ def test_image_names_match_by_trailing_path_components():
         with refused(words):
             pair(left, right)
     with refused(
-        r"image_names must be given for a file of many images, such as \('left\.jpg', 'right\.jpg'\); "
+        r"image_names must be specified for a file of many images, such as \('left\.jpg', 'right\.jpg'\); "
         r"got none\."
     ):
         rigs.names_of_pair(names, CameraChoice())

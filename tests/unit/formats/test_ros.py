@@ -181,7 +181,7 @@ def test_ros_files_of_single_cameras_are_rejected():
     alone = r"These are of single cameras\. Calibrate the pair .*\Z"
     for infos in ([{**left, "projection_matrix": None}, right], [left, {**right, "projection_matrix": None}]):
         with pytest.raises(
-            InputError, match=rf"\Aprojection_matrix must be given in both files; got none\. {alone}"
+            InputError, match=rf"\Aprojection_matrix must be specified in both files; got none\. {alone}"
         ):
             ros(infos)
     with pytest.raises(

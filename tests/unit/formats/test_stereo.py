@@ -296,7 +296,7 @@ def test_kitti_sizes_belong_to_their_own_camera():
         text = kitti(key=key, cameras=(0, 1))[2]
         P = stereo.left_projection_of_kitti(text, CameraChoice((3, 1)))
         np.testing.assert_allclose(P, projection(*KITTI[3]), rtol=1e-12)
-    with refused(r"calibration must be KITTI's \(P_rect_02, or P0 to P3\); got another format\."):
+    with refused(r"calibration must be KITTI's \(P_rect_02, or P0 to P3\); got a different format\."):
         stereo.left_projection_of_kitti("fx: 1\nPx: 3\n", CameraChoice())
 
 

@@ -58,7 +58,7 @@ def test_frame_entries_override_shared_entries():
         {"w": 5, "h": 8, "file_path": "a"},
     ]
     for content, got in (
-        ([1], "another value"),
+        ([1], "a different value"),
         ({}, "with nothing"),
         ({"Frames": [], "w": 3}, "with Frames, w"),
         ({"frames": {}}, "with frames"),
@@ -212,7 +212,7 @@ def test_two_named_images_form_a_pair():
     assert rig.size_left == rig.size_right == (82, 61)
     lost = json.dumps({"frames": [frame(0, transform_matrix=None), frame(1)]})
     with pytest.raises(
-        InputError, match=r"\Atransform_matrix must be given for both images; got none for one of them"
+        InputError, match=r"\Atransform_matrix must be specified for both images; got none for one of them"
     ):
         transforms.read_nerf((lost,), CameraChoice(image_names=names))
 

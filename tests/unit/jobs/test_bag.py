@@ -56,7 +56,7 @@ def run(tmp_path, monkeypatch):
     monkeypatch.setattr(bag.recordings, "write_depth_bag", write_depth_bag)
     monkeypatch.setattr(bag, "start_many", start_many)
     monkeypatch.setattr(bag, "depth_pairs", depth_pairs)
-    topics = {"topic_left": "/l", "topic_right": "/r", "tolerance": 0.25}
+    topics = {"left_topic": "/l", "right_topic": "/r", "tolerance": 0.25}
     asked.options = DepthOptions(left=tmp_path / "run.mcap", out=tmp_path / "depth.bag", **topics)
     return asked
 
@@ -135,7 +135,7 @@ def test_a_bag_is_written_as_one_new_bag(run, tmp_path, monkeypatch):
         ({"out": tmp_path}, "--out must be a file name ending in"),
         ({"shard": "0/2"}, "--shard cannot be used with a bag"),
         ({"engine": "ray"}, "--engine cannot be used with a bag"),
-        ({"topic_left": None}, "--left-topic is missing"),
+        ({"left_topic": None}, "--left-topic is missing"),
     ):
         with pytest.raises(InputError, match=said):
             depth_bag(replace(run.options, **more))

@@ -91,22 +91,23 @@ def test_the_source_has_the_values_of_its_options(given, source):
         ({**UNPOSED, "cy": 5.0}, "--cy needs --fx as well."),
         (
             {**PAIR, **CAMERA, "k": FILE, "e": FILE},
-            "The cameras are given in several ways (parameters and matrices). Give one of: "
+            "The cameras are specified in several ways (parameters and matrices). Pass only one of: "
             "--calib FILE, or --fx --baseline, or --K --E.",
         ),
         (
             {**POINTS, "k": FILE, "fx": 500.0},
-            "The cameras are given in several ways (parameters and matrices). Give one of: "
+            "The cameras are specified in several ways (parameters and matrices). Pass only one of: "
             "--calib FILE, or --fx, or --K.",
         ),
         (
             {**DISPARITY, "k": FILE, "e": FILE, "baseline": 0.1},
-            "The cameras are given in several ways (parameters and matrices). Give one of: "
+            "The cameras are specified in several ways (parameters and matrices). Pass only one of: "
             "--calib FILE, or --fx --baseline, or --K --E.",
         ),
         (
             {**UNPOSED, "k": FILE, "fov": 60.0},
-            "K is given in several ways (matrices and --fov). Give one of: --fx, or --K, or --fov, or EXIF.",
+            "K is specified in several ways (matrices and --fov). Pass only one of: --fx, or --K, or --fov, "
+            "or EXIF.",
         ),
         (
             {**PAIR, **CAMERA, "cropped": True, "cx": 3.0},

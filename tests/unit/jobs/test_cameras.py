@@ -122,7 +122,7 @@ def test_lenses_that_contradict_something_are_rejected(files):
     rectified = made_rig(KS[0], KS[1], ES[1], rectified=True, source="calib.txt")
     path = files / "left.png"
     for given, rig, said in (
-        ({"distortion": (A, B, C)}, None, "--distortion is given 3 times"),
+        ({"distortion": (A, B, C)}, None, "--distortion was passed 3 times"),
         ({"distortion": (FLAT, A)}, rectified, "calib.txt is for rectified images"),
         ({"distortion": (A,), "points_confidence": path}, None, "--points-confidence cannot be used"),
         ({"distortion": (A,), "disparity": path}, None, "--disparity cannot be used"),
@@ -130,7 +130,7 @@ def test_lenses_that_contradict_something_are_rejected(files):
     ):
         with pytest.raises(InputError, match=said):
             lenses_of(options(files, **given), rig)
-    with pytest.raises(InputError, match="--view-K is given, and LEFT has lens distortion"):
+    with pytest.raises(InputError, match="--view-K is set, and LEFT has lens distortion"):
         lenses_of(options(files, "third", distortion=(FLAT, A)))
     with pytest.raises(InputError, match="--view-distortion must be"):
         lenses_of(options(files, "third", view_distortion=("1",)))

@@ -24,7 +24,7 @@ NO_DIFFERENCE = {
     "temporal_smoothing": "added to finished results by the run that asks for it",
     "shard": "which process makes it",
     "engine": "which process makes it",
-    "layout": "another kind of folder",
+    "format": "another kind of folder",
     "workers": "which process makes it",
     "gpus": "which process makes it",
     "device": "equal within rounding",

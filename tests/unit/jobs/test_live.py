@@ -124,11 +124,11 @@ def test_assumptions_about_the_cameras_are_reported_once(options, textured_plane
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"source": ()}, "--source must be given once, or twice.*; got none"),
+        ({"source": ()}, "--source must be passed once, or twice.*; got none"),
         ({"source": ("0", "1", "2")}, "got 3 sources"),
         (
             {"side_by_side": None},
-            "is one view. Give the right camera with another --source, or --side-by-side",
+            "is one view. Pass the right camera with a second --source, or --side-by-side",
         ),
         ({"source": ("0", "1")}, "--side-by-side is for one source"),
         ({"size": "640"}, "--size must be WIDTHxHEIGHT in pixels, such as 1344x376; got '640'"),

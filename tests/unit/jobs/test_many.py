@@ -393,6 +393,6 @@ def test_ray_makes_the_records_where_it_is_the_engine(tmp_path, monkeypatch, alo
         return function
 
     monkeypatch.setattr(many, "on_ray", on_ray)
-    rows, made = depth_pairs(tmp_path, monkeypatch, None, engine="ray", layout="folders")
+    rows, made = depth_pairs(tmp_path, monkeypatch, None, engine="ray", format="folders")
     assert asked == [("pairs_to_folders", "ray", ["a", "b", "c"])] and made == {}
     assert [row["result"] for row in rows] == ["done"] * 3

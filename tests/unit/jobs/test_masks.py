@@ -55,7 +55,7 @@ def test_pixels_of_alpha_0_are_not_valid(files, tmp_path):
     files = shutil.copytree(files, tmp_path / "own")  # others read the images
     valid, image = left_part(files, "left"), (image_of(files, "left") * 255).round().astype(np.uint8)
     Image.fromarray(np.dstack([image, valid.astype(np.uint8) * 255])).save(files / "left.png")
-    with pytest.warns(UserWarning, match="pixels with alpha 0 are not valid"):
+    with pytest.warns(UserWarning, match="transparent pixels .alpha 0. are treated as invalid"):
         pair = read_pair(options(files))
     assert np.array_equal(masks_of(pair)[0], valid) and pair.left.shape == image.shape
 

@@ -128,13 +128,13 @@ UNSUPPORTED = [
     ),
     ({**PAIR, **CAMERA, "fov": 60.0}, "--fov needs --estimate-pose"),
     ({**PAIR, **CAMERA, "known_length": "1,2,3,4,5"}, "--known-length needs --estimate-pose"),
-    ({**PAIR, **CAMERA, "layout": "folders"}, "--format needs --engine ray"),
+    ({**PAIR, **CAMERA, "format": "folders"}, "--format needs --engine ray"),
     ({**PAIR, **CAMERA, "workers": 2}, "--workers needs --engine ray"),
     ({**PAIR, **CAMERA, "gpus": 0.5}, "--gpus needs --engine ray"),
     ({**PAIR, **CAMERA, **RAY, "shard": "0/2"}, "--shard cannot be used with --engine ray"),
     ({**PAIR, **CAMERA, **RAY, "temporal_smoothing": True}, "--temporal-smoothing needs --format folders"),
     ({**PAIR, **CAMERA, **RAY, "export": ("glb",)}, "--export needs --format folders"),
-    ({**PAIR, **CAMERA, **RAY, "layout": "parquet", "reproject": LEFT}, "--reproject needs --format folders"),
+    ({**PAIR, **CAMERA, **RAY, "format": "parquet", "reproject": LEFT}, "--reproject needs --format folders"),
     ({**PAIR, "estimate_pose": True, "calib": (LEFT,)}, "--calib cannot be used with --estimate-pose"),
     ({**PAIR, "estimate_pose": True, "e": LEFT}, "--E cannot be used with --estimate-pose"),
     ({**PAIR, "estimate_pose": True, "cx_right": 3.0}, "--cx-right cannot be used with --estimate-pose"),
@@ -162,14 +162,17 @@ UNSUPPORTED = [
         {"left": LEFT, **CAMERA, "side_by_side": "auto", "export": ("colmap",)},
         "needs one image file per view",
     ),
-    ({**PAIR, **CAMERA, "view": (LEFT, RIGHT), "view_e": (LEFT,)}, "--view-E is given 1 times for 2 --view"),
+    (
+        {**PAIR, **CAMERA, "view": (LEFT, RIGHT), "view_e": (LEFT,)},
+        "--view-E was passed 1 times for 2 --view",
+    ),
     (
         {**PAIR, **CAMERA, "view": (LEFT, RIGHT), "view_e": (LEFT, LEFT), "view_k": (LEFT,)},
-        "--view-K is given 1 times for 2 --view",
+        "--view-K was passed 1 times for 2 --view",
     ),
     (
         {**PAIR, **CAMERA, "view": (LEFT,), "view_e": (LEFT,), "view_distortion": ("0,0", "0,0")},
-        "--view-distortion is given 2 times for 1 --view",
+        "--view-distortion was passed 2 times for 1 --view",
     ),
     ({**PAIR, **CAMERA, "holes": True}, "--holes needs --min-confidence or --max-sigma"),
     (
@@ -224,12 +227,12 @@ TAKEN = [
         **PAIR,
         **CAMERA,
         **RAY,
-        "layout": "folders",
+        "format": "folders",
         "temporal_smoothing": True,
         "export": ("glb",),
         "reproject": LEFT,
     },
-    {**PAIR, **CAMERA, **RAY, "layout": "parquet", "workers": 3, "gpus": 0.5},
+    {**PAIR, **CAMERA, **RAY, "format": "parquet", "workers": 3, "gpus": 0.5},
     {**PAIR, "calib": (LEFT,), "cameras": " 12 , 3 "},
     {"left": LEFT, **CAMERA, "side_by_side": "auto", "export": ("glb",)},
     {**PAIR, **CAMERA, "prior_map": LEFT},
@@ -283,9 +286,9 @@ def test_views_and_other_files_are_listed_with_the_names_of_their_options():
 
 
 def test_the_topics_of_a_bag_are_left_and_right():
-    topics = {"topic_left": "/left", "topic_right": "/right"}
+    topics = {"left_topic": "/left", "right_topic": "/right"}
     assert DepthOptions(left=LEFT, **topics).bag_topics() == ("/left", "/right")
-    for name, flag in (("topic_left", "--left-topic"), ("topic_right", "--right-topic")):
+    for name, flag in (("left_topic", "--left-topic"), ("right_topic", "--right-topic")):
         with pytest.raises(InputError, match=f"^{flag} is missing"):
             DepthOptions(left=LEFT, **topics | {name: None}).bag_topics()
     with pytest.raises(InputError, match="^RIGHT cannot be used with a bag"):
@@ -308,7 +311,7 @@ def test_the_scale_of_a_capture_is_given_in_one_way_and_ray_has_its_options():
     ways = {"metres_per_unit": 2.0, "known_length": "a:1,2,3,4,5", "distance": "a,b,2"}
     for name, value in ways.items():
         assert getattr(CaptureOptions(path=LEFT, **{name: value}), name) == value
-    with pytest.raises(InputError, match="given more than once .--metres-per-unit, --distance"):
+    with pytest.raises(InputError, match="set more than once .--metres-per-unit, --distance"):
         CaptureOptions(path=LEFT, **{name: ways[name] for name in ("distance", "metres_per_unit")})
     assert CaptureOptions(path=LEFT, **RAY, workers=2, gpus=0.5).workers == 2
     for given, said in (
@@ -352,8 +355,8 @@ def test_every_named_file_is_looked_at_before_the_work(files):
     further = replace(given, view=(third,), view_e=(files / "E.txt",))
     check_files(further)
     for changes, said in (
-        ({"right": left}, "RIGHT must be another image than LEFT"),
-        ({"view": (right,)}, "--view 1 must be another image than RIGHT"),
+        ({"right": left}, "RIGHT must be a different image from LEFT"),
+        ({"view": (right,)}, "--view 1 must be a different image from RIGHT"),
         ({"right": files / "none.png"}, "none.png"),
         ({"right": files / "calib.txt"}, "RIGHT must be"),
         ({"calib": (files / "none.txt",)}, "calibration must be"),

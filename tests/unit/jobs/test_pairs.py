@@ -177,7 +177,7 @@ def test_images_of_a_folder_may_hold_both_views_in_one_layout(folders, videos):
 def test_the_frames_of_a_bag_are_its_pairs(monkeypatch):
     asked = []
     monkeypatch.setattr(module, "list_pairs", lambda *given: asked.append(given) or ["a", "b"])
-    bag = DepthOptions(left=Path("run.mcap"), topic_left="/l", topic_right="/r", tolerance=0.25)
+    bag = DepthOptions(left=Path("run.mcap"), left_topic="/l", right_topic="/r", tolerance=0.25)
     assert [ref.name for ref in find_pairs(bag)] == ["000000", "000001"]
     assert asked == [(Path("run.mcap"), ("/l", "/r"), 0.25)]
 
@@ -242,9 +242,11 @@ def test_only_a_table_of_an_earlier_run_is_replaced(folders):
     table.write_text(",".join(COLUMNS) + "\n")
     start_many(options(folders))
     table.write_text("left,right\n")
-    with pytest.raises(InputError, match=r"--out must be a folder without pairs.csv of another program"):
+    with pytest.raises(
+        InputError, match=r"--out must be a folder without a pairs.csv from a different program"
+    ):
         start_many(options(folders))
     table.unlink()
     table.symlink_to(folders / "nowhere")
-    with pytest.raises(InputError, match="pairs.csv of another program"):
+    with pytest.raises(InputError, match="pairs.csv from a different program"):
         start_many(options(folders))

@@ -22,7 +22,7 @@ from geodiff_plugin.jobs.runner import Runner
 
 OURS = ("jobs.ray", "jobs.cluster", "jobs.parquet")
 OPTIONS = DepthOptions(
-    left=Path("left"), out=Path("out"), engine="ray", workers=2, gpus=0.5, layout="folders"
+    left=Path("left"), out=Path("out"), engine="ray", workers=2, gpus=0.5, format="folders"
 )
 
 
@@ -333,7 +333,7 @@ def test_pairs_become_folders_with_the_options_of_a_run_without_ray(ray, stages,
         runner = Runner(items, journal, progress=False)
         records = runner.run_elsewhere(partial(cluster.pairs_to_folders, OPTIONS))
     assert written[0] == ("priors.find_prior", "bundled")
-    alone = replace(OPTIONS, engine="local", layout=None, workers=None, gpus=None)
+    alone = replace(OPTIONS, engine="local", format=None, workers=None, gpus=None)
     assert written[1:] == [alone] * 3 and stages == [alone]
     assert [record["key"] for record in records] == ["p0", "p1", "p2", "p3"]
     assert records[0]["verdict"] == "trusted" and records[3]["status"] == BROKEN
@@ -376,13 +376,13 @@ def test_rows_of_parquet_files_are_counted_as_they_are_written(
 
     monkeypatch.setattr(cluster, "imported", lambda where: lambda prior: None)
     monkeypatch.setattr(cluster, "Store", Store)
-    options = replace(OPTIONS, workers=workers, gpus=0.0, layout="parquet")
+    options = replace(OPTIONS, workers=workers, gpus=0.0, format="parquet")
     result = cluster.pairs_to_parquet(options, refs(pairs))
     failed = {f"p{n}" for n in range(pairs) if n % 10 in (3, 5)}
     assert set(result.failed) == failed and result.failed["p3"] == "p3 is torn"
     assert (result.uri, result.kept, result.done) == ("s3://out", 2, pairs - 2 - len(failed))
     assert result.not_trusted == 0
-    assert begun == [replace(options, engine="local", layout=None, workers=None, gpus=None)]
+    assert begun == [replace(options, engine="local", format=None, workers=None, gpus=None)]
     assert ray.asked[-1][1]["batch_size"] == size
 
     result = cluster.ParquetResult("uri", 0)

@@ -248,7 +248,7 @@ def test_videos_and_bags_are_opened_once_and_closed(monkeypatch):
     monkeypatch.setattr(reading.recordings, "VideoReader", Reader)
     monkeypatch.setattr(reading.recordings, "BagReader", Reader)
     monkeypatch.setattr(reading.Packing, "split", lambda packing, image, name: (packing.layout, image.frame))
-    given = DepthOptions(left=Path("l.mp4"), topic_left="/l", topic_right="/r", tolerance=0.25)
+    given = DepthOptions(left=Path("l.mp4"), left_topic="/l", right_topic="/r", tolerance=0.25)
     made = reading.PairReader(given)
     assert made.frames_of(PairRef("a", Path("a.png"), Path("b.png"))) is None and opened == []
     pair = PairRef("3", Path("l.mp4"), Path("r.mp4"), frame=3)
@@ -281,7 +281,7 @@ def test_damaged_frames_do_not_keep_a_bag_from_having_overlays(monkeypatch):
             return np.hstack(views)
 
     monkeypatch.setattr(reading.recordings, "BagReader", Reader)
-    given = DepthOptions(left=Path("drive.mcap"), topic_left="/l", topic_right="/r")
+    given = DepthOptions(left=Path("drive.mcap"), left_topic="/l", right_topic="/r")
     with reading.PairReader(given) as reader:
         overlays = reader._overlays_of(PairRef("000001", given.left, None, frame=1))
     assert overlays is not None and overlays[16:30, 14:120].mean() > 0.8

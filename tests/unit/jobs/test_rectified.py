@@ -120,7 +120,7 @@ def test_images_select_the_cameras_that_fit(writer, images, tmp_path):
     assert select_rig(rig, images["rectified"]) is rig
     with (
         captured_warnings() as said,
-        pytest.warns(UserWarning, match="The given images are raw: matches lie 0.. px off"),
+        pytest.warns(UserWarning, match="These images are raw: matches lie 0.. px off"),
     ):
         chosen = select_rig(rig, images["taken"])
     np.testing.assert_array_equal(chosen.K_left, K_TAKEN[0])

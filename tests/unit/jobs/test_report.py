@@ -224,7 +224,7 @@ def test_the_line_leads_with_the_verdict_where_it_is_not_trusted(report):
     line = line_of(report)
     assert line.startswith(f"NOT TRUSTED: {made_runs.REASON} (Unreliable: 1.25 m to ")
     unjudged = {"status": "not judged", "reasons": [], "facts": report["verdict"]["facts"]}
-    assert line_of(report, verdict=unjudged).startswith("NOT JUDGED: there are neither matches")
+    assert line_of(report, verdict=unjudged).startswith("NOT JUDGED: there are no matches")
     none = {"min_m": None, "max_m": None, "median_m": None}
     assert line_of(report, depth=none) == "no valid depth; 3.8 s -> out/"
 

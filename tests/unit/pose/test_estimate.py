@@ -610,7 +610,7 @@ def test_each_known_length_gives_the_scale() -> None:
     assert nothing.unit is None and "no unit" in nothing.findings[0]
     with pytest.raises(ValueError, match=r"got \(9000, 150\) with 0 nearby"):  # as it was typed
         find_scale(tracks, units, 0.5, None, (9000, 150, 350, 190, 1.6), None)
-    with pytest.raises(ValueError, match="given once"):
+    with pytest.raises(ValueError, match="specified once"):
         find_scale(tracks, units, 1.0, 0.25, (0, 0, 1, 1, 1), None)
 
 

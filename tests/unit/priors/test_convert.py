@@ -499,7 +499,9 @@ def test_a_checkpoint_of_depthfm_becomes_a_pipeline_with_its_prompt_noise_and_va
         ValueError, match="weights in the checkpoint's state_dict .*missing: .*unexpected: more"
     ):
         convert.convert_prior([tmp_path / "broken.ckpt", tmp_path / "out3"], str(tmp_path / "vae"))
-    with pytest.raises(ValueError, match="--with must be a folder or hub id of Stable Diffusion 1.5"):
+    with pytest.raises(
+        ValueError, match="--with must be a folder or Hugging Face model ID of Stable Diffusion 1.5"
+    ):
         convert.convert_prior([tmp_path / "depthfm.ckpt", tmp_path / "out3"], str(tmp_path / "absent"))
 
 

@@ -128,7 +128,7 @@ def test_steep_edges_stay_steep_where_a_map_is_enlarged():
 @pytest.mark.parametrize(
     ("given", "error", "words"),
     [
-        (None, ValueError, "depth_map must be given"),
+        (None, ValueError, "depth_map must be passed"),
         (3.0, TypeError, "depth_map must be an array"),
         ([make_map(), 3], TypeError, "depth_map must be an array"),
         (np.ones((2, 3, 4, 5)), ValueError, "depth_map must be a map"),

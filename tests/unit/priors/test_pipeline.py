@@ -196,7 +196,7 @@ def test_further_arguments_are_those_of_the_prior(loop):
         ),
         (
             {"latents": torch.zeros(1, 1, 48, 64), "generator": torch.Generator()},
-            "latents and generator must be given one",
+            "latents and generator must be passed one",
         ),
         ({"latents": [1]}, "latents must be None or a torch.Tensor"),
     ],

@@ -118,7 +118,8 @@ def test_a_name_is_a_folder_or_a_hub_id_and_what_it_names_is_frozen(monkeypatch,
     assert asked == [("owner/name", of_half), (str(tmp_path), of_half)]
     for name in ("name", "a/b/c", "./b", "/b", "~/b"):
         with pytest.raises(
-            ValueError, match=f"decoder must be .*an existing folder, or a hub id; got '{name}'"
+            ValueError,
+            match=f"decoder must be .*an existing folder, or a Hugging Face model ID; got '{name}'",
         ):
             codec._loaded(name, torch.float16, "cpu")
     codec._loaded.cache_clear()

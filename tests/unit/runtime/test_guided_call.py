@@ -396,7 +396,7 @@ def test_the_output_is_as_asked_and_an_untrusted_depth_an_error_if_strict():
         ("strict", {"strict": True}),
         ("callback_on_step_end", {"callback_on_step_end": print}),
     ):
-        with pytest.raises(ValueError, match=f"^{name} must be given only with guidance; got guidance=None"):
+        with pytest.raises(ValueError, match=f"^{name} must be passed only with guidance; got guidance=None"):
             pipe(pair.left, **given)
     call = {"generator": seeded(), "num_inference_steps": 1, "processing_resolution": 0}
     with pytest.warns(UserWarning) as reported:

@@ -130,7 +130,7 @@ def test_points_outside_the_image_are_reported():
         (replace(AGREE, ratio=1.1234), "points.differ", "are 1.12 times the matched depths"),
         (replace(AGREE, fraction_off=0.6789), "points.contradict", "68 % of the known depths"),
         (replace(AGREE, fraction_off=0.3456), "points.some-contradict", "35 % of the known depths"),
-        (replace(AGREE, count=2), "points.few", "The image has only 2 known depths; give at least 3."),
+        (replace(AGREE, count=2), "points.few", "The image has only 2 known depths; provide at least 3."),
     ],
 )
 def test_findings_state_the_numbers_of_the_points(points, code, words):
@@ -139,7 +139,7 @@ def test_findings_state_the_numbers_of_the_points(points, code, words):
 
 def test_too_few_points_alone_are_reported_with_how_many_are_needed():
     finding = judged(sheet(replace(AGREE, count=2)), "points.too-few")
-    assert "undetermined: the image has only 2 known depths; give at least 3." in finding
+    assert "undetermined: the image has only 2 known depths; provide at least 3." in finding
 
 
 #: Units that are confused: factor of the points, and what its sentence calls it.

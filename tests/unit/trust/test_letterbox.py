@@ -73,7 +73,7 @@ def test_a_curved_border_and_a_blank_image_are_not_letterboxed():
 
 
 def test_the_finding_states_the_width_of_the_bars():
-    assert "each bar covers 7 % of the image" in judged(good(LetterboxWidth(0.0678)), "views.letterbox")
+    assert "each black bar covers 7 % of the image" in judged(good(LetterboxWidth(0.0678)), "views.letterbox")
     greys = [image((200, 100), (20, 20), 0), image((200, 100), (20, 20), 0)]
     assert Letterbox.of_images(ImagesStage(greys, [200, 200])) == LetterboxWidth(0.1)
     assert Letterbox.of_images(ImagesStage([greys[0], image((200, 100), (0, 0), 0)], [200, 200])) is None

@@ -334,11 +334,11 @@ def test_an_error_is_not_ruled_out():
 #: PoseError -> words of its finding.
 WORDS = {
     PoseError("pose.opengl"): "OpenGL or Blender axes (y up, z backward), so depth is wrong. "
-    "Give diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1).",
+    "Pass diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1).",
     PoseError("pose.opengl-inverse"): "It also seems to be world-to-camera: invert it as well.",
     PoseError("pose.transposed"): "The rotation in E seems to be transposed",
     PoseError("pose.mixed"): "E seems to mix a camera-to-world rotation with a world-to-camera translation",
-    PoseError("camera.swapped"): "K seems to be given as (K_right, K_left)",
+    PoseError("camera.swapped"): "K seems to be passed as (K_right, K_left)",
     PoseError("camera.scaled", 2.0): "K seems to be for images of 0.5 times this width and height",
     PoseError("camera.scaled", 2 / 3): "With s = 0.666667 use fx * s and (cx + 0.5) * s - 0.5",
     PoseError("camera.focal-scaled", 1 / 3): "The focal lengths seem to be for images of 3 times this "
