@@ -91,7 +91,7 @@ class Proof:
 
 
 def pairs_of(data: Path | None, most: int | None) -> Iterator[Pair]:
-    """Yield the bundled pair, then the first ``most`` of a folder of data sets."""
+    """Yield the bundled pair, then the first ``most`` of a folder of datasets."""
     demo = read_demo_pair()
     rig = demo.rig
     yield Pair("bundled", demo.left, demo.right, (rig.K_left, rig.K_right), rig.E, demo.depth_m, demo.valid)
@@ -177,7 +177,7 @@ def page(proofs: list[Proof], pairs: list[Pair], device: torch.device, dtype: to
         lines.append(f"| {' | '.join([*row, f'{proof.peak_bytes / 1e9:.1f}'])} |")
     lines += [
         "",
-        "Mean AbsRel over the pairs; `authors`: published by the authors for their data sets, in per cent.",
+        "Mean AbsRel over the pairs; `authors`: published by the authors for their datasets, in per cent.",
     ]
     absent = [proof for proof in proofs if proof.absent]
     if absent:
@@ -195,7 +195,7 @@ def main(argv: list[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("priors", nargs="*", help="hub ids and folders (default: those of PUBLISHED)")
-    parser.add_argument("--data", type=Path, help="folder of data sets, in addition to the bundled pair")
+    parser.add_argument("--data", type=Path, help="folder of datasets, in addition to the bundled pair")
     parser.add_argument("--pairs", type=int, help="maximum number of pairs")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")

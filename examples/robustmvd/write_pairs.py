@@ -3,7 +3,7 @@
     python -m examples.robustmvd.write_pairs kitti OUT
     geodiff eval pairs OUT --datasets mvsnet --methods guided,sweep-sgm
 
-The first argument is a data set of the benchmark (kitti, dtu, scannet, tanks_and_temples, eth3d), whose
+The first argument is a dataset of the benchmark (kitti, dtu, scannet, tanks_and_temples, eth3d), whose
 path is set in its ``paths.toml``. Each sample becomes a folder with its key view, the nearest source view
 in the list, their cameras and the ground truth. Poses and intrinsics are given, so depth is scored in
 metres, without alignment. For tanks_and_temples and eth3d, whose cameras are COLMAP's, add ``--pixel-centre

@@ -80,7 +80,7 @@ def score_pairs(
 
 def _table(rows: list[dict[str, str | float]]) -> str:
     lines = [
-        "| data set | pair | prior | delta1 | plane | constant |",
+        "| dataset | pair | prior | delta1 | plane | constant |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     keys = ("prior", "delta1", "plane", "constant")

@@ -1,6 +1,6 @@
-"""Evaluates methods: data sets, metrics, resumable runs, tables and figures (paper S5).
+"""Evaluates methods: datasets, metrics, resumable runs, tables and figures (paper S5).
 
-To extend: a data set is a reader and a row of ``datasets``, a method a class and a row of ``baselines``
+To extend: a dataset is a reader and a row of ``datasets``, a method a class and a row of ``baselines``
 (docs/how-to/extending.md).
 Layer 11: imports ``jobs``, ``capture`` and below; ``cli`` imports it.
 """

@@ -22,7 +22,7 @@ Map = np.ndarray
 #: KITTI).
 FLOOR_M = 1e-5
 #: Maximum aligned depth, metres, of predictions that decrease with depth.
-FARTHEST_M = 1000.0
+MAX_ALIGNED_M = 1000.0
 #: Maximum ratio of an inlier in the Robust Multi-View Depth Benchmark.
 INLIER = 1.03
 #: Metrics of depths ``(p, t)`` in metres, over pixels with both. Deltas are fractions of max(p/t, t/p) below
@@ -199,7 +199,7 @@ def to_space(depth_m: Map, space: str) -> Map:
 def align(values: Map, ground_truth_m: Map, valid: Map, space: str = "depth") -> Map:
     """Align ``values``, correct up to scale and shift in a space of ``SPACES``, to depth ``(H, W)`` metres.
 
-    The result is at least ``FLOOR_M``, and at most ``FARTHEST_M`` if values decrease with depth. It is NaN
+    The result is at least ``FLOOR_M``, and at most ``MAX_ALIGNED_M`` if values decrease with depth. It is NaN
     where ``values`` is not finite, and everywhere if no pixel has ground truth and prediction. Source:
     Marigold's evaluation, ``least_square`` and ``least_square_disparity``, the latter over positive
     predictions only.
@@ -216,7 +216,7 @@ def align(values: Map, ground_truth_m: Map, valid: Map, space: str = "depth") ->
     scale, shift = np.linalg.lstsq(pairs, target, rcond=None)[0]
     x = torch.from_numpy(values * scale + shift)
     if not kind.grows_with_depth:
-        x = x.clamp_min(float(to_space(np.array(FARTHEST_M), space)))
+        x = x.clamp_min(float(to_space(np.array(MAX_ALIGNED_M), space)))
     depth_m = kind.forward(x, torch.ones((), dtype=torch.float64)).numpy()  # for a global scale of 1
     return np.where(np.isfinite(values), np.maximum(depth_m, FLOOR_M), np.nan)
 

@@ -307,7 +307,7 @@ def split_tables(records: Sequence[Record]) -> list[Table]:
 
 
 def benchmark_tables(records: Sequence[Record]) -> list[Table]:
-    """Return the metrics of the data sets' own benchmarks, for rectified and for posed pairs."""
+    """Return the metrics of the datasets' own benchmarks, for rectified and for posed pairs."""
     done = [record for record in records if record["status"] == "ok" and record["all_pixels"]["raw"]]
     columns: dict[str, CellOf] = {"dataset": lambda group: group[0]["dataset"], "method": method_title}
     columns |= {"pairs": lambda group: str(len(group)), "AbsRel": mean_of("all_pixels.raw.abs_rel")}

@@ -16,7 +16,7 @@ What belongs here:
       ``lengths`` has known and measured lengths, ``provenance`` records the inputs of finished frames.
     - The engine: ``runner`` takes items through stages and resumes by a ``journal``; ``failures`` reports
       each cause once; ``processes`` are workers on this machine. ``cluster`` runs jobs on many machines with
-      Ray: ``ray`` (with ``actor`` and ``rows``) is the data set of pairs, ``parquet`` stores its results.
+      Ray: ``ray`` (with ``actor`` and ``rows``) is the dataset of pairs, ``parquet`` stores its results.
     - Videos and benchmark files from finished results: ``results``.
     - Shared by all commands: messages to the user (``notices``), SIGTERM (``stopping``), out-of-memory errors
       (``memory``).

@@ -1,4 +1,4 @@
-"""Reads data sets in their official layouts, and the user's own folders (S5.1, Tables 1 to 3)."""
+"""Reads datasets in their official layouts, and the user's own folders (S5.1, Tables 1 to 3)."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ _SCENES_2021 = (
 
 
 def _set_of_scene(root: Path, folder: Path, ground_truth: Path) -> str:
-    """Return the data set of a folder in Middlebury's format, from the names of folders and files."""
+    """Return the dataset of a folder in Middlebury's format, from the names of folders and files."""
     parts = (root.resolve().name, *folder.relative_to(root).parts)
     if any("eth3d" in part.lower() or "two_view" in part for part in parts):
         return "eth3d"
@@ -377,7 +377,7 @@ def _load_folder(ref: SampleRef) -> StereoSample:
 
 #: Options for finding posed pairs, in addition to the folder.
 _POSED = ("pairs", "pixel_centre")
-#: All data sets, in the order of the results.
+#: All datasets, in the order of the results.
 LAYOUTS = [
     Dataset(
         name="kitti2015",

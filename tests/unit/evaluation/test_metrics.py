@@ -117,7 +117,7 @@ def test_alignment_clips_what_lies_behind_the_camera_or_too_far_and_keeps_holes(
     aligned = metrics.align(
         values, ground_truth, ground_truth > 0, "disparity"
     )  # the last is no part of the fit
-    np.testing.assert_allclose(aligned, [[1.0, 2.0, metrics.FARTHEST_M]])
+    np.testing.assert_allclose(aligned, [[1.0, 2.0, metrics.MAX_ALIGNED_M]])
     behind = metrics.align(np.array([[1.0, 2.0, -4.0]]), ground_truth, np.array([[True, True, False]]))
     assert behind[0, 2] == metrics.FLOOR_M
     for space, hole in (("depth", NAN), ("disparity", 0.0)):

@@ -213,8 +213,9 @@ def expected(f: Numbers) -> tuple[str, list[str], list[str]]:
     alone = math.isnan(f.matched)
     stated = f.range_given and f.at_end <= 0.2
     unusual = f.view_deg < 15 or f.view_deg > 120
-    wrong = off(f.points_ratio) > LOG(1.2) or f.points_off > 0.5
-    by_factor = off(f.points_ratio) >= LOG(1.08)
+    large_factor, mostly_off = off(f.points_ratio) > LOG(1.2), f.points_off > 0.5
+    wrong = large_factor or mostly_off
+    by_factor = off(f.points_ratio) >= LOG(1.08) and (large_factor or not mostly_off)
     contradict = not by_factor and f.points_off > 0.25
     wide = not f.spread < 0.15
     shown = f.ambiguity < 0.3 or f.occlusion > 0.35
