@@ -43,7 +43,7 @@ class AlignedView:
     valid: Tensor | None
     scale: np.ndarray
     shift: np.ndarray
-    masked: bool = False
+    masked: bool
 
     @property
     def guide(self) -> Tensor:

@@ -71,7 +71,10 @@ def fov_of(fx: float, width: int = 64) -> float:
         ),
         ("images", {}, {"baseline": 0.12, "estimate_pose": True}),
         ("images", {"camera": "fx"}, {"baseline": 0.12, "estimate_pose": True, **LENS}),
-        ("images", {"camera": "fov", "fov": 71.0}, {"baseline": 0.12, "estimate_pose": True, "fov": 71.0}),
+        *(
+            ("images", {"camera": "fov", "fov": fov}, {"baseline": 0.12, "estimate_pose": True, "fov": fov})
+            for fov in (1.0, 71.0, 170.0)
+        ),
         (
             "images",
             {"scale_input": "known", "known_length": 2.5, "ends": "-1, 2.5;30 y 4"},
@@ -142,7 +145,8 @@ def test_the_scale_has_the_uncertainty_of_its_source(pair):
         ("images", {"baseline_error": -1.0}, "Its accuracy must be above 0."),
         ("images", {"camera": "fx", "lens": {}}, "Enter fx, the focal length in pixels, or choose"),
         ("images", {"camera": "fov"}, "Enter the field of view across the width of the image"),
-        ("images", {"camera": "fov", "fov": 190.0}, "1 to 170 degrees"),
+        ("images", {"camera": "fov", "fov": 170.1}, "1 to 170 degrees"),
+        ("images", {"camera": "fov", "fov": 0.9}, "1 to 170 degrees"),
         ("images", {"scale_input": "known"}, "Images alone have no scale. Enter the known length."),
         ("images", {"scale_input": "known", "known_length": 2.0}, "Mark both ends of the known length"),
         (

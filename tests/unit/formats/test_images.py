@@ -211,6 +211,13 @@ def test_values_of_every_type_are_fractions_of_its_range(tmp_path):
             as_image_01(value, "left")
 
 
+def test_the_maximum_of_16_bit_colour_is_stated_in_its_own_range(tmp_path):
+    """Pillow reads its upper 8 bits only: 2 of 255 is 514 of 65535."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((40, 50, 3), 600, np.uint16))
+    (finding,) = read_image(tmp_path / "a.png")[1]
+    assert finding.code == "image.dark" and "its maximum is 514 of 65535" in finding
+
+
 @pytest.mark.parametrize(("most", "is_told"), [(8191, True), (8192, False)])
 def test_nearly_black_images_of_16_bits_are_reported(most, is_told, tmp_path):
     values = np.linspace(0, most, 40 * 50).reshape(40, 50).astype(np.uint16)

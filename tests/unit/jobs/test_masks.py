@@ -81,6 +81,8 @@ def test_each_of_many_images_has_the_mask_of_its_name(tmp_path):
     ref = PairRef("a", Path("x/a.jpg"), Path("y/b.jpg"))
     own = options_of(ref, replace(base, right_mask=tmp_path))
     assert (own.mask, own.right_mask) == (tmp_path / "a.png", tmp_path / "b.jpg.png")
+    both = PairRef("a", Path("x/a.png"), None)  # with both views in one image
+    assert options_of(both, replace(base, right_mask=tmp_path)).right_mask == tmp_path / "a.png"
     frame = PairRef("000004", Path("x.mp4"), None, frame=4)
     assert options_of(frame, base).mask == tmp_path / "000004.png"
     assert options_of(ref, replace(base, mask=tmp_path / "a.png")).mask == tmp_path / "a.png", "one for all"

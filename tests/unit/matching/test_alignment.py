@@ -166,7 +166,7 @@ def scaled_view(count: int, valid: bool) -> AlignedView:
     scale, shift = rng.uniform(0.7, 1.4, count), rng.uniform(-12, 12, (count, 2))
     scale[2] = 0.0
     mask = torch.from_numpy(rng.random(canvas.shape) < 0.7) if valid else None
-    return AlignedView(torch.from_numpy(canvas).float(), mask, scale, shift)
+    return AlignedView(torch.from_numpy(canvas).float(), mask, scale, shift, masked=False)
 
 
 def shifted_view(valid: bool) -> AlignedView:
@@ -176,7 +176,7 @@ def shifted_view(valid: bool) -> AlignedView:
     shift = np.stack([rng.integers(-160, 120, count) / 8, 1.25 + rng.integers(0, 4, count) / 4], 1)
     shift[[5, 11], 0] = -95.0, 90.0  # further than the canvas: its repeated edge alone
     mask = torch.from_numpy(rng.random(canvas.shape) < 0.7) if valid else None
-    return AlignedView(torch.from_numpy(canvas).float(), mask, np.ones(count), shift)
+    return AlignedView(torch.from_numpy(canvas).float(), mask, np.ones(count), shift, masked=False)
 
 
 @pytest.mark.parametrize("valid", [False, True])
@@ -227,12 +227,15 @@ def test_only_planes_that_are_shifts_to_an_eighth_of_a_pixel_are_taken_for_shift
 
     def taken(scale=1.0, drift=1.0, planes=count) -> bool:
         changed = (shift * [1.0, drift])[:planes]
-        return even_shifts(AlignedView(canvas, None, np.full(planes, scale), changed), width) is not None
+        return (
+            even_shifts(AlignedView(canvas, None, np.full(planes, scale), changed, masked=False), width)
+            is not None
+        )
 
     assert taken() and not taken(planes=31)
     assert taken(drift=1.05) and not taken(drift=1.06)
     for sign in (1, -1):
         assert taken(scale=1 + sign * 0.124 / width) and not taken(scale=1 + sign * 0.126 / width)
-    found = even_shifts(AlignedView(canvas, None, np.ones(count), shift), width)
+    found = even_shifts(AlignedView(canvas, None, np.ones(count), shift, masked=False), width)
     np.testing.assert_allclose(np.array(found.columns) / 8, shift[:, 0], atol=1 / 16)
     np.testing.assert_allclose(np.array(found.rows) / 4, shift[:, 1], atol=1 / 8)

@@ -9,7 +9,16 @@ import torch
 
 from geodiff_plugin.matching import build_cost_volume, match_volume
 from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.repetition import _second_minimum, if_repeated, settle, with_repetition
+from geodiff_plugin.matching.repetition import (
+    CELL,
+    MIN_PERIOD,
+    _cells,
+    _rise,
+    _second_minimum,
+    if_repeated,
+    settle,
+    with_repetition,
+)
 from tests.views import posed_of
 
 SIZE, FOCAL, BASELINE = (96, 160), 100.0, 0.2
@@ -133,3 +142,16 @@ def test_a_candidate_beyond_infinity_is_none():
     volume = SimpleNamespace(levels=torch.full((30, 40, 60), 50, dtype=torch.uint8), size=(40, 60))
     flat = with_repetition(replace(matches_of(np.ones((40, 60)), np.zeros((40, 60)), 0.1)), volume)
     assert not flat.repeated.any()
+
+
+def test_cells_are_square_and_cover_the_image():
+    cells = _cells(torch.zeros(3, 5 * CELL, 7 * CELL - 1, dtype=torch.uint8))
+    assert cells.shape == (3, 5, 7)
+
+
+def test_a_flat_minimum_rises_alike_at_both_of_its_planes():
+    away = torch.arange(4 * MIN_PERIOD).sub(2 * MIN_PERIOD).abs().float()
+    costs = torch.cat([away[: 2 * MIN_PERIOD + 1], away[2 * MIN_PERIOD :]])
+    rise = _rise(costs.view(-1, 1, 1)).flatten()
+    assert rise[2 * MIN_PERIOD] == rise[2 * MIN_PERIOD + 1] == MIN_PERIOD - 1
+    assert (rise > 0).sum() == 2

@@ -90,6 +90,11 @@ def test_the_cost_of_the_prior_has_the_stated_value_slope_and_curvature():
     )
     at_given = solve._prior_terms(scene.tracks, given, given, w, PRIOR)
     assert at_given.cost == pytest.approx(0.0, abs=1e-12)
+    unseen = replace(scene.tracks, seen=np.zeros_like(scene.tracks.seen))
+    alone = solve._prior_terms(unseen, given, given, w, PRIOR).normal.reshape(2, 6, 2, 6)
+    for v in (0, 1):  # without tracks neither views nor rotation and centre depend on each other
+        assert not alone[v, :, 1 - v].any() and not alone[v, :3, v, 3:].any()
+        assert np.count_nonzero(alone[v, :3, v, :3]) == 3
     for step in 1e-4 * np.random.default_rng(0).normal(size=(8, 12)):
         cost = prior_cost(scene, discontinuity(given, step), given, w, PRIOR)
         assert step @ at_given.normal @ step == pytest.approx(cost, rel=0.02)

@@ -60,6 +60,7 @@ def test_a_file_is_played_at_its_rate(tmp_path, views):
     video = write_video(
         tmp_path / "rig.avi", [np.hstack(pair) for pair in zip(*views, strict=True)], fps=20.0
     )
+    assert CameraSource([video])._interval_s == pytest.approx(0.05)
     begun = time.perf_counter()
     arrived = [frame.arrived_s - begun for frame in CameraSource([video])]
     np.testing.assert_array_less([-1e-9, 0.045, 0.095], arrived)
