@@ -197,3 +197,10 @@ def test_a_stored_result_has_every_part(tmp_path):
     rounded_up = again.sigma_m[known] - shown.sigma_m[known]
     assert (rounded_up > -1e-6).all() and (rounded_up < 1.001e-3).all()
     assert replace(again, image=shown.image).K.tolist() == K.tolist()
+
+
+def test_a_stored_result_is_not_unpickled(tmp_path):
+    np.savez(tmp_path / "a.npz", words=np.array([object()]))
+    Image.fromarray(made_result().image).save(tmp_path / "left.png")
+    with pytest.raises(ValueError, match="allow_pickle"):
+        load(tmp_path / "a.npz", tmp_path / "left.png", "an example")

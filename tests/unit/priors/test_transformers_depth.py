@@ -494,7 +494,7 @@ def test_both_layouts_load_and_answer_the_same(kind, layout_of, tmp_path):
 def test_every_class_of_the_library_is_guided_or_rejected():
     guided = {type(MODELS[kind]()[0]).__name__ for kind in MODELS}
     assert guided | {NO_DEPTH} == set(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values())
-    with pytest.raises(ValueError, match="canopy height"):
+    with pytest.raises(ValueError, match="prior must be a depth model; got .*canopy height"):
         echo("GLPN", model=type(NO_DEPTH, (EchoingModel,), {})())
 
 

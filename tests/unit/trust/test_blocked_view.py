@@ -6,7 +6,7 @@ import pytest
 
 from geodiff_plugin.trust import FactSheet, ImagesStage
 from geodiff_plugin.trust.blocked_view import BlankRegions, BlockedView, blank_fraction
-from tests.unit.trust.sheets import Case, good
+from tests.unit.trust.sheets import Case, good, judged
 from tests.unit.trust.test_defocus import texture
 
 CASES = [
@@ -75,3 +75,11 @@ def test_masked_pixels_show_nothing():
     (finding,) = found(BlockedView.of_images(masked))
     assert "of the right image is blank or masked" in finding
     assert not found(BlockedView.of_images(masked._replace(valid=[valid, valid])))
+
+
+@pytest.mark.parametrize("left", [0.0, 0.41])
+def test_both_fractions_are_stated_with_their_images(left):
+    message = judged(good(BlankRegions(left, 0.41 - left, 0)), "views.blocked")
+    blank, other = ("left image", "right image") if left else ("right image", "left image")
+    assert message.startswith(f"41 % of the {blank} is blank")
+    assert f"only 0 % of the {other}" in message
