@@ -24,7 +24,7 @@ class Severity(Enum):
 
     REASON = "reason"  # the result is not trusted
     REMARK = "remark"  # unusual, but possibly correct
-    ASSUMPTION = "assumption"  # the result is correct if the assumption holds
+    ASSUMPTION = "assumption"  # the result depends on an assumption that was not verified
     WARNING = "warning"  # other information about the input, its handling, or the output
 
 
@@ -157,8 +157,8 @@ _KINDS = (
         WARNING,
         "The 16-bit images in a bag are treated as 10-, 12- or 14-bit images",
         cause="The camera records 10, 12 or 14 bits, and its driver stores the values without scaling.",
-        hint="Ignore this warning unless the camera records 16 bits and the scene was dark; the images then "
-        "appear too bright.",
+        hint="Ignore this warning unless the camera records 16 bits and the scene was dark. In that case, "
+        "the images appear too bright.",
     ),
     FindingKind(
         "image.alpha",
@@ -171,7 +171,7 @@ _KINDS = (
         "image.rotated",
         WARNING,
         "The image was rotated according to its EXIF orientation",
-        cause="The camera stored the image in a different orientation and recorded it in EXIF.",
+        cause="The camera stored the image unrotated and recorded its orientation in EXIF.",
         hint="Pass K for the upright image.",
     ),
     FindingKind(
@@ -213,7 +213,7 @@ _KINDS = (
         "camera.zoom",
         WARNING,
         "The image was taken with digital zoom",
-        cause="Some cameras do not include a digital zoom in their EXIF focal length.",
+        cause="The EXIF data record digital zoom, which some cameras do not include in the focal length.",
         hint="Retake the image without digital zoom, or provide K.",
     ),
     FindingKind(
@@ -270,7 +270,7 @@ _KINDS = (
     FindingKind(
         "calibration.doffs",
         WARNING,
-        "The right cx in a Middlebury file contradicts doffs",
+        "For a Middlebury file, the right cx is computed as cx0 + doffs",
         cause="cam1 is missing, or its cx differs from cx0 + doffs, on which the ground truth is based.",
         hint="Ignore this warning if the file is the published one; otherwise correct doffs or cam1.",
     ),
@@ -300,14 +300,14 @@ _KINDS = (
     FindingKind(
         "estimate.second-motion",
         WARNING,
-        "Part of the scene moved",
+        "Some matches follow a second motion",
         cause="An object moved between the images, or the scene has a repetitive pattern.",
         hint="Capture both images simultaneously, or capture a static scene.",
     ),
     FindingKind(
         "estimate.learned",
         ASSUMPTION,
-        "The poses come from learned matches",
+        "The poses were estimated from matches of a learned feature matcher",
         cause="No pose could be estimated from SIFT features: the images are dark or blurred, or have little "
         "or repetitive texture.",
         hint="Check the result, for example with a known length. Take brighter, sharper images.",
@@ -364,14 +364,14 @@ _KINDS = (
     FindingKind(
         "prior.one-member",
         WARNING,
-        "Only one ensemble member runs",
+        "Only one ensemble member is computed",
         cause="The prior is deterministic.",
         hint="Leave ensemble_size (--ensemble) at 1 with this prior.",
     ),
     FindingKind(
         "capture.skipped",
         WARNING,
-        "Frames are skipped",
+        "Some frames are skipped",
         cause="A frame has no image file, no pose, or an unsupported camera; the message states which.",
         hint="Ignore this warning if enough frames remain.",
     ),
@@ -461,7 +461,7 @@ _KINDS = (
         "capture.assumed-k",
         WARNING,
         "K is the published value for the dataset",
-        cause="7-Scenes and TUM RGB-D have no calibration file.",
+        cause="The folder has no calibration file, as is usual for 7-Scenes and TUM RGB-D.",
         hint="Pass K (--K) if a different camera was used.",
     ),
     FindingKind(

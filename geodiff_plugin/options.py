@@ -56,6 +56,8 @@ DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which imports torch. A test keeps both in sync.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")
 PRESETS = ("default", "fast", "paper")
+#: ``min_steps`` of the default preset, which commands without ``--preset`` use. A test keeps both in sync.
+MIN_STEPS = 4
 #: Engines that process batches.
 ENGINES = ("local", "ray")
 
@@ -128,6 +130,15 @@ _guidance = partial(setting, section=GUIDANCE, affects=RESULT)
 _speed, _machines = (partial(setting, section=section, affects=NOTHING) for section in (SPEED, MACHINES))
 
 
+def _steps(minimum: str) -> Any:
+    """Declare the number of denoising steps, whose default is at least ``minimum``."""
+    help_text = (
+        f"Number of denoising steps (default: the prior's default, but at least {minimum}). One-step priors "
+        "allow only 1."
+    )
+    return _prior(None, help_text, low=1, high=1000)
+
+
 @dataclass(frozen=True, kw_only=True)
 class PriorOptions:
     """The prior and the device: options of every command that runs a prior."""
@@ -143,13 +154,7 @@ class PriorOptions:
         "(default: from its config).",
         choices=SPACES,
     )
-    steps: int | None = _prior(
-        None,
-        "Number of denoising steps (default: the prior's default, raised to the preset's min_steps). "
-        "One-step priors allow only 1.",
-        low=1,
-        high=1000,
-    )
+    steps: int | None = _steps(f"{MIN_STEPS}")
     seed: int = _prior(0, "Seed for the random noise.", low=0, high=2**63 - 1)
     dtype: str = _prior("float32", "Precision of the prior: float32, float16 or bfloat16.", choices=DTYPES)
     device: str = _prior("auto", "Device: auto, cpu, cuda, cuda:N or mps.", affects=NOTHING)
@@ -161,8 +166,8 @@ class SpeedOptions:
 
     cuda_graphs: bool = _speed(
         False,
-        "Run the networks as CUDA graphs, with a faster group norm in half precision. Always on for batches "
-        "and captures on CUDA.",
+        "Run the networks as CUDA graphs; in half precision, also use a faster group norm. Always enabled "
+        "for batches and captures on a CUDA device.",
     )
     no_triton: bool = _speed(False, "Disable the Triton kernels and run all stages in plain PyTorch.")
 
@@ -202,6 +207,7 @@ MACHINE_RULES = (
 class RunOptions(PriorOptions):
     """Run options that ``geodiff depth``, the web app and the ComfyUI node share."""
 
+    steps: int | None = _steps("the preset's min_steps")
     option: tuple[str, ...] = _prior(
         (), "Prior-specific option as NAME=VALUE, such as domain=outdoor for GeoWizard; repeatable."
     )
@@ -218,12 +224,14 @@ class RunOptions(PriorOptions):
         low=0,
         high=8192,
     )
-    near: float | None = _guidance(None, "Nearest depth to search, in metres.", above_0="metres")
-    far: float | None = _guidance(None, "Farthest depth to search, in metres.", above_0="metres")
+    near: float | None = _guidance(None, "Nearest depth to search, in metres; needs --far.", above_0="metres")
+    far: float | None = _guidance(
+        None, "Farthest depth to search, in metres; needs --near.", above_0="metres"
+    )
     preset: str = _guidance(
         "default",
-        "Preset: default, fast (coarser matches, one match fit, the prior's default number of steps, poses "
-        "used as given) or paper (Algorithm 1).",
+        "Preset: default, fast (coarser matches, a single fit to the matches, the prior's default number of "
+        "steps, poses used as given) or paper (Algorithm 1).",
         choices=PRESETS,
     )
     parameter: tuple[str, ...] = _guidance(

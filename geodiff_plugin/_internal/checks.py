@@ -1,4 +1,4 @@
-"""Check user input and raise errors that state what was expected, what was found, and a hint."""
+"""Check user input and raise errors that state what is wrong and, in most cases, how to correct it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ Problem = TypeVar("Problem", bound="InputError")
 
 
 class InputError(ValueError):
-    """An input that cannot be used. The message states what is wrong and how to correct it.
+    """An input that cannot be used.
+
+    The message states what is wrong and, in most cases, how to correct it.
 
     Attributes:
         code: identifies the error for programs with messages of their own, such as the web app; often empty.

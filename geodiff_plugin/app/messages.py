@@ -124,7 +124,11 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "Enter the measured distance between the cameras.",
     ),
     "calibration.unrectified": ("The images are treated as not rectified.", _CALIBRATION),
-    "calibration.doffs": ("The right cx in the calibration contradicts doffs.", _CALIBRATION),
+    "calibration.doffs": (
+        "The right camera's cx is computed from doffs: it is missing in the calibration, or contradicts "
+        "doffs.",
+        _CALIBRATION,
+    ),
     "calibration.assumed-lens": ("The focal length is the usual one for this dataset.", _CALIBRATION),
     "calibration.kitti-cameras": ("KITTI's colour cameras are used.", "Use images of the colour cameras."),
     "baseline.long": ("With this baseline, the cameras are more than 20 m apart.", _LENGTH),

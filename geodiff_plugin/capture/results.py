@@ -56,7 +56,7 @@ VIDEO_SIZE = (1280, 480)
 VIDEO_FPS = 5.0
 #: Side of a cell relative to the median depth; points in one cell are merged.
 CELL_FRACTION = 0.004
-#: Minimum confidence of points in the cloud.
+#: Minimum confidence of points in the cloud and the exports.
 MIN_CONFIDENCE = 0.5
 #: Maximum number of points per frame; more would not be visible in a cloud of many frames.
 MAX_POINTS = 200_000
@@ -347,9 +347,11 @@ def _slope(points: np.ndarray, known: np.ndarray, axis: int) -> np.ndarray:
 
 
 def kept(frame: DepthFrame) -> np.ndarray:
-    """Return the ``(H, W)`` mask of cloud points: confident or confirmed, uncontradicted, not flying.
+    """Return the ``(H, W)`` mask of the pixels in the cloud and the exports.
 
-    Pixels without a neighbour of known depth along the row or the column have no normal.
+    It excludes pixels without depth, with a confidence below ``MIN_CONFIDENCE``, without a normal (no
+    neighbour of known depth along the row or the column), or that other frames see but do not confirm, and
+    flying points.
     """
     known = frame.depth > 0
     good = known & (frame.confidence >= MIN_CONFIDENCE) & ~flying_points(frame.depth)

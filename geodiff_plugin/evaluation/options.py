@@ -149,13 +149,15 @@ class PairsOptions(SampleOptions):
     sample: int | None = count_of(None, "Number of random samples, drawn with --seed.")
     pairs: str = setting(
         "default",
-        "Pairs of posed views: default (two per scene) or all.",
+        "Pairs of views in posed datasets: default (one pair per group or key view) or all (every listed "
+        "pair).",
         choices=("default", "all"),
         section=SAMPLES,
     )
     pixel_centre: float | None = setting(
         None,
-        "Coordinate of the centre of the first pixel in posed cameras: 0, or 0.5 as in COLMAP.",
+        "Coordinate of the centre of the first pixel in the cameras of posed datasets: 0, or 0.5 as in "
+        "COLMAP.",
         section=SAMPLES,
     )
     stop_on_broken: bool = setting(
@@ -298,17 +300,23 @@ _TABLE = {
         _PAPER,
         "Table 4 of the paper, and variants with a single change: gradients, optimizers or loss terms.",
     ),
-    "parts": _Entry(PairsOptions, _CHANGES, "Ablation: remove one component of the default at a time."),
-    "flatness": _Entry(
-        PairsOptions, _CHANGES, "Sensitivity: halve and double one parameter of the default at a time."
+    "parts": _Entry(
+        PairsOptions,
+        _CHANGES,
+        "Ablation: remove or change the components of the default preset, one at a time.",
     ),
-    "cost": _Entry(PairsOptions, "pairs.run_cost", "Run time and peak memory, plain and guided."),
+    "flatness": _Entry(
+        PairsOptions,
+        _CHANGES,
+        "Sensitivity: halve and double the main parameters of the default preset, one at a time.",
+    ),
+    "cost": _Entry(PairsOptions, "pairs.run_cost", "Run time and peak memory of plain and guided calls."),
     "figure": _Entry(FigureOptions, "figures.run_figure", "Draw a figure as PNG, with its numbers as JSON."),
     "baseline": _Entry(
         PairsOptions,
         "baseline_scale.run_baseline_scale",
-        "Measure whether the depth scales with the baseline when it is halved or doubled, and stays the same "
-        "when the right image is resized (and so has a different K).",
+        "Test whether the depth scales with the baseline when the baseline is halved or doubled, and whether "
+        "it stays the same when the right image is resized (which changes its K).",
     ),
     "poses": _Entry(PosesOptions, "poses.run_poses", "Compare given, refined, estimated and wrong poses."),
     "capture": _Entry(

@@ -137,13 +137,14 @@ class RigOptions(RunOptions):
     )
     distortion: tuple[str, ...] = _camera(
         (),
-        "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; repeat the option if the right lens "
-        "differs.",
+        "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; pass it once for both lenses, or once "
+        "per lens.",
     )
     cropped: bool = _camera(False, "Allow a principal point outside the image, for cropped images.")
     mask: Path | None = _masks(
         None,
-        "Mask of LEFT: white pixels are valid, others get no depth. For many pairs, one mask or a folder.",
+        "Mask of LEFT: white pixels are valid; all others get no depth. For many pairs, one mask or a "
+        "folder.",
     )
     right_mask: Path | None = _masks(None, "Mask of RIGHT, like --mask.")
     fill: bool = _masks(False, "Fill invalid pixels with the prior's depth, at low confidence.")
@@ -169,7 +170,8 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     right: Path | None = setting(
         None,
-        "Right image, folder or video. Omit it with --points, or if LEFT contains both views.",
+        "Right image, folder or video. Optional with --points or --disparity. Omit it if LEFT is a bag or a "
+        "list, or contains both views.",
         "",
         metavar="RIGHT",
         affects=RESULT,
@@ -190,19 +192,20 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     view_k: tuple[Path, ...] = _further(
         (),
-        "Intrinsics of a --view; repeat it once per view, in the same order (default: same as LEFT).",
+        "Intrinsics of an additional view; pass it once per --view, in the same order (default: same as "
+        "LEFT).",
         "--view-K",
     )
     view_e: tuple[Path, ...] = _further(
         (),
-        "Pose of a --view in the left camera's frame: a 4x4 matrix in metres. Repeat it once per view, in "
-        "the same order.",
+        "Pose of an additional view in the left camera's frame: a 4x4 matrix in metres, or tx ty tz qx qy qz "
+        "qw. Pass it once per --view, in the same order.",
         "--view-E",
     )
     view_distortion: tuple[str, ...] = _further(
         (),
-        "Lens distortion of a --view; repeat it once per view, in the same order, with 0,0,0,0 for none "
-        "(default: same as LEFT).",
+        "Lens distortion of an additional view; pass it once per --view, in the same order. Use 0,0,0,0 for "
+        "a view without distortion (default: same as LEFT).",
     )
     prior_map: Path | None = _prior(
         None,
@@ -301,7 +304,8 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     strict: bool = _output(
         False,
-        "Fail unless the depth is trusted. With many pairs, each pair that is not trusted counts as failed.",
+        "Fail unless the depth is trusted. With many pairs, each pair that is not trusted or not judged "
+        "counts as failed.",
     )
     quiet: bool = _output(False, "Hide the progress bar and the summary.", "--quiet", "-q")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
@@ -406,7 +410,7 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
         ):
             if len(given) not in counts:
                 times = f"{len(given)} times for {views} --view"
-                raise_input_error(f"{option} was passed {times}. Pass it once per view.")
+                raise_input_error(f"{option} was passed {times}. Pass it once per --view.")
 
     def camera_source(self) -> CameraSource:
         """Return how the cameras are given; ``InputError`` as in ``find_source``."""
@@ -533,8 +537,8 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
     )
     mask: Path | None = setting(
         None,
-        "Folder with the mask of each frame, or one mask for all frames: white pixels are valid, others get "
-        "no depth (default: masks in the capture).",
+        "Folder with the mask of each frame, or one mask for all frames: white pixels are valid; all others "
+        "get no depth (default: masks in the capture).",
         section=MASKS,
         affects=Affects.INPUTS,
     )
@@ -553,8 +557,8 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
         DepthOptions,
         "min_confidence",
         0.0,
-        help="Minimum confidence, 0 to 1, of points in point clouds and exports. Values below 0.5 have no "
-        "effect on the fused cloud and the exports. With --holes, it also applies to the depth maps.",
+        help="Minimum confidence, 0 to 1, of points in point clouds and exports. The fused cloud and the "
+        "exports always require at least 0.5. With --holes, it also applies to the depth maps.",
     )
     max_sigma: float | None = _like(DepthOptions, "max_sigma", None)
     holes: bool = _like(DepthOptions, "holes", False)
@@ -585,8 +589,8 @@ class LiveOptions(SpeedOptions, RigOptions):
 
     source: tuple[str, ...] = setting(
         (),
-        "Camera index (0 is the first camera), video file, or stream URL (rtsp://...). Pass it twice if "
-        "the left and the right camera are separate, the left one first.",
+        "Camera index (0 is the first camera), video file, or stream URL (rtsp://...). If the left and right "
+        "cameras are separate devices, pass it twice, left first.",
         metavar="SOURCE",
     )
     side_by_side: str | None = _like(
@@ -607,8 +611,8 @@ class LiveOptions(SpeedOptions, RigOptions):
     )
     check_every: int = setting(
         100,
-        "Number of frames between checks of the poses, the images and letterbox bars. With 0, the poses are "
-        "used as given, and only the first frame is checked for letterbox bars.",
+        "Check the poses and the images, and look for letterbox bars, every this many frames. With 0, the "
+        "poses are used as given, and only the first frame is checked for letterbox bars.",
         low=0,
         high=10**9,
     )
@@ -617,22 +621,23 @@ class LiveOptions(SpeedOptions, RigOptions):
         RunOptions,
         "preset",
         "fast",
-        help="Preset: default, fast (coarser matches, one match fit, the prior's default number of steps) or "
-        "paper (Algorithm 1). --check-every, not the preset, determines whether poses are refined.",
+        help="Preset: default, fast (coarser matches, a single fit to the matches, the prior's default "
+        "number of steps) or paper (Algorithm 1). --check-every, not the preset, determines whether poses "
+        "are refined.",
     )
     mask: Path | None = _like(
         RigOptions,
         "mask",
         None,
-        help="Mask of the left images: white pixels are valid, others get no depth.",
+        help="Mask of the left images: white pixels are valid; all others get no depth.",
     )
     right_mask: Path | None = _like(
         RigOptions, "right_mask", None, help="Mask of the right images, like --mask."
     )
     out: Path | None = _output(
         None,
-        "Output folder: left images, depth and its standard deviation as 16-bit PNG in millimetres, K.txt "
-        "and frames.csv.",
+        "Output folder for the left images, the depth and its standard deviation (both as 16-bit PNGs in "
+        "millimetres), K.txt and frames.csv.",
         "--out",
         "-o",
     )

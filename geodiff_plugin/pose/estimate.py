@@ -74,8 +74,9 @@ NO_UNIT = Finding(
 
 LEARNED = Finding(
     "estimate.learned",
-    "No pose could be estimated from SIFT features, so the poses come from learned matches (XFeat), which "
-    "may be wrong without any other symptom. Check the result, or take brighter, sharper images.",
+    "No pose could be estimated from SIFT features, so the poses were estimated from matches of a learned "
+    "feature matcher (XFeat). They may be wrong without any other symptom. Check the result, or take "
+    "brighter, sharper images.",
 )
 #: Matches sparse features of the left image in the right ones.
 Matcher = Callable[[Sequence[GreyImage]], Tracks]

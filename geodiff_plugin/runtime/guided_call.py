@@ -83,7 +83,7 @@ class GuidedCall(_Stock):
             callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``. If
                 it returns ``latents``, they replace the pipeline's. The other values come from the latest
                 guided step and ``None`` before the first.
-            strict: whether to raise an error if a depth is not trusted or not assessed (``output.verdict``).
+            strict: whether to raise an error if a depth is not trusted or not judged (``output.verdict``).
             **kwargs: passed to the stock call.
 
         Returns:
@@ -351,7 +351,7 @@ def _one_member(call: dict[str, Any]) -> dict[str, Any]:
     for name, kind in (("generator", list), ("latents", Tensor)):
         if isinstance(call[name], kind):
             changed[name] = call[name][first]
-    sentence = "This prior is deterministic, so only one ensemble member runs."
+    sentence = "This prior is deterministic, so only one ensemble member is computed."
     warn(Finding("prior.one-member", sentence), stacklevel=5)
     return changed
 

@@ -26,10 +26,10 @@ PRIOR_ORDER = FindingKind(
     "prior.order",
     REMARK,
     "According to the matches, the prior inverts near and far",
-    cause="The prior was not trained on scenes like this. Or the supplied prior map is for a different "
-    "image, is rotated, or is in a different prediction space.",
-    hint="Check the map and its prediction space (--space). Matched regions are unaffected; elsewhere the "
-    "depth follows the prior and has a low confidence.",
+    cause="The prior was not trained on scenes like this, or the supplied prior map is rotated, is for a "
+    "different image, or is in a different prediction space.",
+    hint="Check the map and its prediction space (--space). Matched regions are unaffected; elsewhere, the "
+    "depth follows the prior and has low confidence.",
 )
 
 

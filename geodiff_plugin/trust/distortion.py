@@ -28,7 +28,7 @@ RESIDUAL_TREND = FindingKind(
     REASON,
     "Epipolar residuals vary systematically across the image",
     cause="E has a wrong rotation, a rolling shutter sheared the right image, or lens distortion was not "
-    "removed. The matches fit all of these equally well.",
+    "removed. All of these explain the matches equally well.",
     hint="Check the rotation of E, and that the images are rectified with this calibration.",
 )
 

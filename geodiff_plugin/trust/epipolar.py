@@ -18,22 +18,24 @@ FEW_MATCHES = FindingKind(
     "pose.few-matches",
     REASON,
     "There are too few feature matches to confirm either the refined or the given pose",
-    cause="The given pose contradicts optical flow, and there are too few feature matches to check it "
-    "reliably.",
+    cause="The given pose contradicts the optical flow between the images, which have too little texture or "
+    "overlap to check it reliably.",
     hint="Provide a more accurate pose, or use views with more texture or overlap.",
 )
 KEPT = FindingKind(
     "pose.kept",
     WARNING,
     "The given pose has an epipolar error above 1 px, and no nearby pose is clearly better",
-    cause="K, the distortion or the order of the views is wrong, or objects moved between the images.",
+    cause="The pose is inaccurate, objects moved between the images, a rolling shutter or lens distortion "
+    "deforms the images, K is for a different image size, the views are in the wrong order, or the poses are "
+    "world-to-camera.",
     hint="Check the causes in the message in the order listed.",
 )
 REFINED = FindingKind(
     "pose.refined",
     WARNING,
-    "The given pose had an epipolar error above 1 px and was refined",
-    cause="Poses from trackers, SLAM or a drifted rig are inaccurate.",
+    "The given pose had an epipolar error above 1 px (0.45 px for a rectified rig) and was refined",
+    cause="The pose is from a tracker or SLAM, or the cameras of the rig have shifted since calibration.",
     hint="No action is needed if the refined error is below 1 px; otherwise check the causes in the message.",
 )
 TOO_FAR = FindingKind(

@@ -27,7 +27,7 @@ OUTSIDE = FindingKind(
 FACTOR = FindingKind(
     "points.factor",
     REASON,
-    "Known and matched depths differ by a large factor",
+    "Known and matched depths differ by more than 20 %",
     cause="A unit, the baseline or K is wrong, or the points are in the wrong frame.",
     hint="Check the unit of the points, the baseline and K.",
 )

@@ -15,7 +15,7 @@ from geodiff_plugin.trust.stages import PosesStage, TracksStage
 NEGATIVE_DISPARITY = FindingKind(
     "depth.negative-disparity",
     REASON,
-    "Matches have negative disparity",
+    "Some matches have negative disparity",
     cause="The right camera's cx or the rotation of E is wrong, the right image was cropped or stretched, or "
     "objects moved between the images.",
     hint="Pass the right camera's own K (K_right, --K-right, --cx-right); check E and the right image.",

@@ -22,7 +22,7 @@ OPENGL = FindingKind(
     "pose.opengl",
     REASON,
     "The pose seems to use OpenGL axes",
-    cause="In OpenGL and Blender, y points up and z points backward.",
+    cause="E comes from OpenGL or Blender, where y points up and z points backward.",
     hint="Pass diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1).",
     explains=NEGATIVE_DISPARITY,
 )
@@ -30,7 +30,8 @@ OPENGL_INVERSE = FindingKind(
     "pose.opengl-inverse",
     REASON,
     "The pose seems to be world-to-camera in OpenGL axes",
-    cause="In OpenGL and Blender, y points up and z points backward, and E is inverted.",
+    cause="E comes from OpenGL or Blender, where y points up and z points backward, and it is the inverse "
+    "(world-to-camera) pose.",
     hint="Pass inv(diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1)).",
     explains=NEGATIVE_DISPARITY,
 )

@@ -17,8 +17,8 @@ SCALE = FindingKind(
     "scale.uncertain",
     REASON,
     "The scale of the refined pose is uncertain",
-    cause="The baseline is not declared as measured, and it implies a different scale for the refined pose "
-    "than the scene depth does.",
+    cause="The baseline is not declared as measured, and the scale that it implies for the refined pose "
+    "differs from the scale implied by the scene depth.",
     hint="Specify the measured baseline (--baseline, measured_baseline=True), or provide at least three "
     "known points.",
 )

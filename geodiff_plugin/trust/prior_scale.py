@@ -26,7 +26,7 @@ UNIT = FindingKind(
 METRES = FindingKind(
     "prior.metres",
     REMARK,
-    "The depth differs from the metric prior by a large factor",
+    "The depth differs from the metric prior by a factor of 1.9 to 20",
     cause="The baseline is not in metres, K is for a different image size, or the prior was not trained on "
     "scenes like this.",
     hint="Check the baseline and K. Ignore this message if the prior was trained on different kinds of "

@@ -70,7 +70,7 @@ def measure_pair() -> Pair:
         folder_seconds = _core_seconds(lambda: write_pair(out, run))
     return Pair(
         read_bytes=sum(path.stat().st_size for path in images.values()),
-        written_bytes=len(columns["depth_mm"]) + len(columns["confidence"]),
+        written_bytes=sum(len(column) for column in columns.values() if isinstance(column, bytes)),
         read_seconds=_core_seconds(read),
         row_seconds=_core_seconds(lambda: result_columns(run)),
         folder_seconds=folder_seconds,

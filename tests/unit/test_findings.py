@@ -3,6 +3,7 @@
 import ast
 import copy
 import json
+import math
 import pickle
 import re
 import warnings
@@ -13,7 +14,10 @@ import pytest
 import geodiff_plugin
 from geodiff_plugin._internal.checks import captured_warnings, warn
 from geodiff_plugin.findings import FINDINGS, GROUPS, Finding, Severity, as_records, dedupe, some_names
-from geodiff_plugin.trust import KINDS
+from geodiff_plugin.pose.fit import FITS_PX
+from geodiff_plugin.trust import KINDS, Epipolar
+from geodiff_plugin.trust.known_points import KnownPoints
+from geodiff_plugin.trust.prior_scale import PriorScale
 from tests.pages import check_generated
 
 PACKAGE = Path(geodiff_plugin.__file__).parent
@@ -148,6 +152,14 @@ def _tables() -> str:
 def test_the_page_of_messages_is_up_to_date():
     """``GEODIFF_WRITE=1 pytest tests/unit/test_findings.py`` regenerates its tables."""
     check_generated(PAGE, BEGIN, _tables(), END)
+
+
+def test_titles_state_the_limits_of_their_checks():
+    assert f"above {Epipolar.WARNS_PX:g} px ({FITS_PX:g} px for" in KINDS["pose.refined"].title
+    percent = 100 * (math.exp(KnownPoints.MAX_LOG_RATIO) - 1)
+    assert f"more than {percent:.0f} %" in KINDS["points.factor"].title
+    remarked, most = map(math.exp, (PriorScale.REMARKED_LOG_RATIO, PriorScale.MAX_LOG_RATIO))
+    assert KINDS["prior.metres"].title.endswith(f"by a factor of {remarked:.3g} to {most:.3g}")
 
 
 def test_debugging_page_names_codes_that_exist():

@@ -33,6 +33,7 @@ def test_what_all_commands_that_run_a_prior_have_in_common():
     for record in (PriorOptions, SpeedOptions, RunOptions, MachineOptions):
         assert list(settings_of(record)) == [field.name for field in fields(record)]
         assert {option.section for option in settings_of(record).values()} <= set(SECTIONS)
+    assert PRESETS["default"].min_steps == module.MIN_STEPS
     assert settings_of(RunOptions)["seed"].help == "Seed for the random noise."
     assert len(set(SECTIONS)) == len(SECTIONS)
 

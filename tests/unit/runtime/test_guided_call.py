@@ -97,7 +97,7 @@ def test_what_no_pipeline_takes_is_rejected(changes, message):
 def test_a_prior_that_always_gives_the_same_map_runs_the_first_member_of_every_image():
     generators, latents = [object() for _ in range(6)], torch.arange(6.0).view(6, 1, 1, 1)
     call = {"ensemble_size": 3, "generator": generators, "latents": latents, "output_uncertainty": True}
-    with pytest.warns(match="only one ensemble member runs") as reported:
+    with pytest.warns(match="only one ensemble member is computed") as reported:
         changed = _one_member(call)
     assert reported[0].message.args[0].code == "prior.one-member"
     assert changed.pop("generator") == [generators[0], generators[3]]
@@ -113,7 +113,10 @@ def test_the_warning_about_members_points_at_the_call(monkeypatch):
     monkeypatch.setattr(guided_call, "compile_kernels", lambda *_: 1 / 0)
     pipe, pair = enable_geometry_guidance(make_e2e_ft()), plane_pair()
     guidance = GeometryGuidance(pair.right, pair.K, pair.E)
-    with pytest.warns(match="only one ensemble member runs") as reported, pytest.raises(ZeroDivisionError):
+    with (
+        pytest.warns(match="only one ensemble member is computed") as reported,
+        pytest.raises(ZeroDivisionError),
+    ):
         pipe(pair.left, guidance=guidance, ensemble_size=2)
     assert [each.filename for each in reported] == [__file__]
     with pytest.raises(ZeroDivisionError):  # one member needs no warning
