@@ -65,7 +65,7 @@ MISTAKES: dict[str, Change] = {
     "baseline in millimetres": KINDS["millimetres"].change,
     SWAPPED: KINDS["swapped"].change,
     "E inverted": KINDS["inverse"].change,
-    "K for a 1.5x larger image": KINDS["K-1.5"].change,
+    "focal lengths of K 1.5x too large": KINDS["K-1.5"].change,
     "right cx off by 10 px": _centre_off,
     "right image rotated by 3 degrees": _turned,
     "right image upside down": _upside_down,
