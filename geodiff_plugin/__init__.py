@@ -5,7 +5,7 @@
 >>> depth_m = out.prediction  # (1, H, W, 1), metres
 
 The method follows GeoDiff (arXiv 2510.18291). Read the code along the path of one image, in three phases:
-``evidence`` (what the views show, before any network runs), ``algorithm`` (what guidance does at each
+``evidence`` (what the views show, before the first guided step), ``algorithm`` (what guidance does at each
 denoising step), ``result`` (depth at the image's size, its confidence and its verdict). ``runtime`` runs them
 in a call of the pipeline. Below them lie ``types``, ``geometry``, ``config``, ``matching``, ``pose`` and
 ``scale``.

@@ -17,7 +17,7 @@ from geodiff_plugin.cameras import Camera
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
 from geodiff_plugin.evaluation.metrics import align
-from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration
+from geodiff_plugin.formats import CALIBRATION_FORMATS, captures, read_calibration, read_capture
 from geodiff_plugin.matching import points_to_matches
 from geodiff_plugin.priors import PRIORS
 from geodiff_plugin.priors.components import DirectScheduler
@@ -37,6 +37,7 @@ def page():
     """The names that the page's blocks define, the tables with what they add; all as before afterwards."""
     tables = (PRIORS, TERMS, OPTIMIZERS, SPACES, CALIBRATION_FORMATS, DATASETS, METHODS)
     before = [(table, dict(table)) for table in tables]
+    layouts = captures.LAYOUTS
     names: dict = {}
     for block in BLOCKS:
         exec(compile(block, PAGE.name, "exec"), names)
@@ -44,6 +45,7 @@ def page():
     for table, entries in before:
         table.clear()
         table.update(entries)
+    captures.LAYOUTS = layouts
 
 
 @pytest.mark.parametrize("table", ALONE)
@@ -62,14 +64,17 @@ def test_a_block_runs_in_a_file_of_its_own(page, table):
 
 
 def test_the_capture_format_of_the_page_is_read(page, tmp_path):
-    Image.new("RGB", (640, 480)).save(tmp_path / "a.png")
+    for name in ("a.png", "c.png"):
+        Image.new("RGB", (640, 480)).save(tmp_path / name)
     pose = " ".join(map(str, np.eye(4).ravel()))
-    (tmp_path / "ink.txt").write_text(f"500 {pose} a.png\n500 {pose} b.png\n")
+    (tmp_path / "ink.txt").write_text("".join(f"500 {pose} {name}.png\n" for name in "abc"))
     layout = page["read_ink_capture"](tmp_path)
-    first, second = layout.candidates
+    first, second, _ = layout.candidates
     np.testing.assert_array_equal(first.frame.E, np.eye(4))
     assert layout.unit == "m" and first.camera.K[0, 0] == 500 and second.problem
     assert page["read_ink_capture"](tmp_path / "nowhere") is None
+    found = read_capture(tmp_path)
+    assert found.kind == "ink" and [frame.name for frame in found.frames] == ["a", "c"]
 
 
 def test_what_the_page_adds_works(page, textured_plane, tmp_path):

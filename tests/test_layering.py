@@ -161,7 +161,7 @@ def _table() -> str:
         path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
         first = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").split("\n\n")[0]
         rows.append(f"| {layer} | `{part}` | {' '.join(first.split()).replace('``', '`')} |")
-    return "\n".join(["| layer | package or module | holds |", "| ---: | --- | --- |", *rows])
+    return "\n".join(["| layer | package or module | purpose |", "| ---: | --- | --- |", *rows])
 
 
 def test_architecture_page_has_the_packages_as_they_describe_themselves() -> None:

@@ -1,4 +1,4 @@
-"""Serves the web app, ``geodiff app``: metric depth from two images, with measurements (extra ``app``).
+"""Serves the web app, ``geodiff app``: depth from two images, with measurements (requires the ``app`` extra).
 
 Belongs here: the form, the page and its sessions. Functionality shared with the commands is in ``jobs``.
 To extend: a field of the form is an option of ``jobs.options`` with an entry in ``form``.

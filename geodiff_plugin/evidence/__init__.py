@@ -1,4 +1,4 @@
-"""Implements phase 1, for one image: checks the input and prepares the evidence before any network runs.
+"""Implements phase 1, for one image: checks inputs and prepares the evidence before the first guided step.
 
 Belongs here: ``inputs`` checks the input; ``prepare`` cleans and matches the views; ``pose_check`` checks and
 refines their poses; ``plan`` defines what runs concurrently. The outcome is an ``Evidence`` (paper S3.3,
