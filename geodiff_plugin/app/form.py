@@ -42,10 +42,9 @@ CALIBRATION_HEIGHT = 104
 DROP_HERE = "Drop or choose"
 #: Options of handlers that only the page calls.
 QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
-#: Options of handlers of changes: after several quick ones, the last one is handled.
-LAST = QUICK | {"trigger_mode": "always_last"}
-#: Options of handlers of taps: each of several quick taps is handled, in order.
-TAPS = QUICK | {"queue": True, "concurrency_limit": 1, "trigger_mode": "multiple"}
+#: Options of handlers that each of several quick events reaches, in order. In gradio's other modes, an event
+#: is dropped, or an earlier one is handled last.
+IN_ORDER = QUICK | {"queue": True, "concurrency_limit": 1, "trigger_mode": "multiple"}
 #: Labels of the optional number fields.
 NUMBERS = {
     "fx": "fx, px",
@@ -207,12 +206,11 @@ def _views() -> dict[str, Any]:
     groups = _camera_fields(drawn)
     for name, label in (("left", "the left image"), ("right", "the right image")):
         inputs = [drawn[name], drawn["camera_input"], drawn["camera"]]
-        gr.on(
-            [field.change for field in inputs], partial(_file_note, name=label), inputs, notes[name], **LAST
-        )
+        note = partial(_file_note, name=label)
+        gr.on([field.change for field in inputs], note, inputs, notes[name], **IN_ORDER)
     sources = [drawn[name] for name in ("camera_input", "camera", "scale_input")]
     groups_shown = partial(_visible, list(groups))
-    gr.on([field.change for field in sources], groups_shown, sources, list(groups.values()), **LAST)
+    gr.on([field.change for field in sources], groups_shown, sources, list(groups.values()), **IN_ORDER)
     return drawn
 
 
@@ -292,7 +290,7 @@ def _length_fields(drawn: dict[str, Any]) -> None:
         label="Its two ends, px", placeholder="tap them above", max_lines=1, elem_id="ends"
     )
     inputs = [drawn[name] for name in ("left", "camera_input", "scale_input")]
-    gr.on([field.change for field in inputs], _known_image, inputs, image, **LAST)
+    gr.on([field.change for field in inputs], _known_image, inputs, image, **IN_ORDER)
     drawn["left"].change(lambda: "", outputs=drawn["ends"], **QUICK)
 
 

@@ -17,7 +17,7 @@ import gradio as gr
 
 from geodiff_plugin._internal.checks import InputError, UnknownFormatError
 from geodiff_plugin.app import results, templates
-from geodiff_plugin.app.form import QUICK, TAPS, Form, build_examples, build_form
+from geodiff_plugin.app.form import IN_ORDER, QUICK, Form, build_examples, build_form
 from geodiff_plugin.app.job import EXAMPLES, Priors, Request, run_job, write_job
 from geodiff_plugin.app.messages import Message, PageError, error_on_page
 from geodiff_plugin.app.results import Measurement
@@ -440,9 +440,11 @@ def _wire_run(desk: _Handlers, examples: gr.Gallery) -> None:
     form.stop.click(desk.stop, **QUICK)
 
 
-def _wire_form(desk: _Handlers) -> None:
+def _wire_form(desk: _Handlers, examples: gr.Gallery) -> None:
     """Connect the handlers of uploads and of changed inputs."""
     drops = [desk.form.fields[name] for name in ("left", "right", "calib")]
+    images = [field.upload for field in drops[:2]]
+    gr.on(images, lambda: gr.Gallery(selected_index=None), None, examples, **QUICK)  # no longer an example
     gr.on([field.upload for field in drops], desk.note_uploads, drops, None, **QUICK)
     changes = [event for field in drops for event in (field.upload, field.clear)]
     gr.on(changes, None, js=templates.CHANGED, queue=False)
@@ -452,11 +454,12 @@ def _wire_measuring(desk: _Handlers) -> None:
     """Connect the handlers of measured points: clicks in the 3D view or on the image, and typed pixels."""
     panels, secret = desk.panels, desk.secret
     measured = [panels.marks_data, panels.headline, panels.readings]
-    panels.pick.click(desk.add_point, [secret, panels.picked], measured, js=templates.PICKED, **TAPS)
+    in_order = IN_ORDER | {"concurrency_id": "points"}
+    panels.pick.click(desk.add_point, [secret, panels.picked], measured, js=templates.PICKED, **in_order)
     typed = [panels.add.click, panels.pixel.submit]
-    gr.on(typed, desk.add_point, [secret, panels.pixel], measured, **QUICK)
-    gr.on([button.click for button in panels.undo], desk.undo_point, secret, measured, **QUICK)
-    gr.on([button.click for button in panels.clear], desk.clear_points, secret, measured, **QUICK)
+    gr.on(typed, desk.add_point, [secret, panels.pixel], measured, **in_order)
+    gr.on([button.click for button in panels.undo], desk.undo_point, secret, measured, **in_order)
+    gr.on([button.click for button in panels.clear], desk.clear_points, secret, measured, **in_order)
     panels.tabs.select(desk.open_tab, secret, panels.files, **QUICK)
 
 
@@ -525,7 +528,7 @@ def build_page(priors: Priors) -> gr.Blocks:
                 form = build_form(priors)
         desk = _Handlers(form, panels, secret, priors, sessions, RunQueue(), progress)
         _wire_run(desk, examples)
-        _wire_form(desk)
+        _wire_form(desk, examples)
         _wire_measuring(desk)
         restored = [*desk.of_result(), form.fields["camera_input"]]
         page.load(desk.restore, [secret, by_phone], restored, js=templates.COME_BACK, **QUICK)

@@ -227,7 +227,8 @@ def test_at_first_the_fields_of_a_calibration_file_are_seen(drawn):
 def test_a_source_shows_the_fields_that_it_needs_with_fitting_placeholders(given, seen, drawn, monkeypatch):
     fields = [drawn.form.fields[name] for name in ("camera_input", "camera", "scale_input")]
     handler = next(f for f in handlers(drawn, fields[2], "change") if len(f.outputs) > 1)
-    assert not handler.queue and [i._id for i in handler.inputs] == [field._id for field in fields]
+    assert handler.trigger_mode == "multiple" and handler.concurrency_limit == 1
+    assert [i._id for i in handler.inputs] == [field._id for field in fields]
     assert {(field._id, "change") for field in fields} == set(handler.targets)
     groups = handler.fn.args[0]
     updates = dict(zip(groups, handler.fn(*given), strict=True))

@@ -267,13 +267,18 @@ def test_clicks_call_what_they_should_with_their_fields(page, desk):
     (changed,) = [f for f in page.fns if f.js == templates.CHANGED]
     check(changed, [(field, event) for field in drops for event in ("upload", "clear")], [], [], queue=False)
     measured = [panels.marks_data, panels.headline, panels.readings]
+    in_order = quick | {"queue": True, "trigger_mode": "multiple", "concurrency_limit": 1}
+    in_order |= {"concurrency_id": "points"}
     picked, typed = page.of("add_point")
-    check(picked, [(panels.pick, "click")], [secret, panels.picked], measured, js=templates.PICKED)
-    assert picked.queue and picked.trigger_mode == "multiple" and picked.concurrency_limit == 1
-    check(typed, [(panels.add, "click"), (panels.pixel, "submit")], [secret, panels.pixel], measured, **quick)
+    check(
+        picked, [(panels.pick, "click")], [secret, panels.picked], measured, js=templates.PICKED, **in_order
+    )
+    check(
+        typed, [(panels.add, "click"), (panels.pixel, "submit")], [secret, panels.pixel], measured, **in_order
+    )
     for name, buttons in (("undo_point", panels.undo), ("clear_points", panels.clear)):
         assert len(buttons) == 2, "in the 3D view and next to the readings"
-        check(page.of(name)[0], [(button, "click") for button in buttons], [secret], measured, **quick)
+        check(page.of(name)[0], [(button, "click") for button in buttons], [secret], measured, **in_order)
     check(page.of("open_tab")[0], [(panels.tabs, "select")], [secret], [panels.files], **quick)
     (back,) = page.of("restore")
     assert back.outputs == [*outputs, form.fields["camera_input"]] and back.js == templates.COME_BACK
