@@ -130,6 +130,21 @@ def test_any_number_of_steps_from_a_field_that_is_given(device, seed, size, step
     assert_same_fields(system, steps, torch.full_like(system.rhs, 0.3))
 
 
+@pytest.mark.parametrize("left", [3e38, -3e38, float("nan")])
+def test_what_was_in_memory_before_changes_nothing(device, left, monkeypatch):
+    """It must not be computed with either: NumPy warns of overflows in the interpreter."""
+    system = random_system(3, (9, 14), 1, 2, device)
+    expected = solve_field(system, 3)
+    empty = torch.Tensor.new_empty
+
+    def filled(self, *size, **more):
+        tensor = empty(self, *size, **more)
+        return tensor.fill_(left) if tensor.is_floating_point() else tensor
+
+    monkeypatch.setattr(torch.Tensor, "new_empty", filled)
+    assert torch.equal(solve_field(system, 3), expected)
+
+
 def test_links_of_one_sample_hold_for_a_batch(device):
     """As ``FieldSystem`` broadcasts them."""
     two, one = random_system(0, (9, 14), 2, 1, device), random_system(0, (9, 14), 1, 1, device)

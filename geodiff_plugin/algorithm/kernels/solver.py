@@ -304,8 +304,9 @@ def _direction_tile(system, work, partial, step, tile, tiles, count, p, n, width
     z_upper, before_upper = _parts_of_direction(work, area, p - width, n, step)
     z_lower, before_lower = _parts_of_direction(work, area, p + width, n, step)
     beta = _total(partial + (step % 2) * count, tiles)
-    beta /= tl.maximum(_total(partial + ((step + 1) % 2) * count, tiles), TINY)
-    beta = tl.where(step > 0, beta, 0.0)  # the first step has no previous direction
+    # The first step has no previous direction, and the sums of the step before it were never written.
+    beta /= tl.maximum(_total(partial + ((step + 1) % 2) * count, tl.where(step > 0, tiles, 0)), TINY)
+    beta = tl.where(step > 0, beta, 0.0)
     direction = z + beta * before
     product = diagonal * direction
     product -= to_left * (z_left + beta * before_left)
