@@ -34,11 +34,17 @@ def run(page) -> None:
 
 
 def tab(page, name: str) -> None:
-    shown = page.get_by_role("tab", name=name)
-    if shown.first.is_visible():
-        shown.first.click()
-    else:  # on a phone some are behind three dots
-        page.locator(".overflow-menu > button").click()
+    """Open a tab; on a phone some are behind three dots. The page may still be arranging them."""
+    shown, more = page.get_by_role("tab", name=name).first, page.locator(".overflow-menu > button").first
+    for _ in range(400):
+        before = shown.is_visible(), more.is_visible()
+        page.wait_for_timeout(150)
+        if any(before) and before == (shown.is_visible(), more.is_visible()):
+            break
+    if before[0]:
+        shown.click()
+    else:
+        more.click()
         page.locator(".overflow-dropdown button", has_text=name).click()
 
 
