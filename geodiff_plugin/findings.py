@@ -425,7 +425,8 @@ _KINDS = (
         WARNING,
         "The camera file has no poses",
         cause="It was written before the images were aligned.",
-        hint="The poses are estimated. To use the program's own poses, export them after alignment.",
+        hint="The poses are estimated. To use the poses of the program that wrote the file, "
+        "export them after alignment.",
     ),
     FindingKind(
         "capture.size-mismatch",
@@ -476,8 +477,8 @@ _KINDS = (
         WARNING,
         "Many frames have no pose with a matching timestamp",
         cause="The trajectory and the video start at different times, or their timestamps do not match.",
-        hint="Shift the timestamps so that the first frame is at 0. Phones record at a variable rate, so use "
-        "the container's timestamps, not frame number / frame rate.",
+        hint="Shift the trajectory's timestamps so that the first video frame is at 0. Phones record at a "
+        "variable rate, so take frame times from the container, not from frame number / frame rate.",
     ),
     FindingKind(
         "capture.blurred",

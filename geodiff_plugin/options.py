@@ -213,8 +213,8 @@ class RunOptions(PriorOptions):
     )
     ensemble: int = _prior(
         1,
-        "Number of ensemble predictions, each with different noise. With two or more, their spread is "
-        "written as the uncertainty.",
+        "Number of ensemble predictions, each with different noise; the result is their median. geodiff "
+        "depth also writes their spread to uncertainty.npy.",
         low=1,
         high=1000,
     )

@@ -17,8 +17,8 @@ SCALE = FindingKind(
     "scale.uncertain",
     REASON,
     "The scale of the refined pose is uncertain",
-    cause="The baseline is not declared as measured, and the scale that it implies for the refined pose "
-    "differs from the scale implied by the scene depth.",
+    cause="The baseline is not declared as measured, and two estimates of the scale of the refined pose "
+    "differ: one from the given baseline, one from the depth of the matches under the given pose.",
     hint="Specify the measured baseline (--baseline, measured_baseline=True), or provide at least three "
     "known points.",
 )
