@@ -124,6 +124,8 @@ class CoverageMap:
             tests[test.split("::")[0]][test] = {"seconds": duration, "lines": masks}
         for file in files:
             found = tests.get(file.as_posix(), {})
+            if not found:  # all its tests failed or were lost with their process; recorded again next time
+                continue
             executed = {name for test in found.values() for name in test["lines"]}
             hashes = {name: _hash(name) for name in [file.as_posix(), *sorted(executed)]}
             content = json.dumps({"hashes": hashes, "tests": found})

@@ -5,6 +5,7 @@ Loaded by ``coverage_map.py`` with ``-p tests.mutation.record`` and ``GEODIFF_MU
 
 import json
 import os
+import warnings
 from pathlib import Path
 
 import coverage
@@ -49,7 +50,9 @@ class Recorder:
     def pytest_sessionfinish(self):
         # Not in pytest_unconfigure: pytest-xdist may end its workers before that is done.
         self.coverage.stop()
-        self.coverage.save()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that lines executed at import, before coverage started, are unknown
+            self.coverage.save()
         seconds = {test: self.seconds[test] for test in self.passed}
         (self.folder / f"seconds-{os.getpid()}.json").write_text(json.dumps(seconds), encoding="utf-8")
 
