@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._internal.kernels import has_kernel
+from geodiff_plugin._internal.kernels import has_kernel, launch_bound
 from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.alignment import AlignedView
@@ -93,10 +93,37 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
 
 def window_mean(maps: Tensor, radius: int) -> Tensor:
     """Average maps ``(..., C, H, W)`` over a window of this half width, clipped to the image."""
-    for window in ((2 * radius + 1, 1), (1, 2 * radius + 1)):
-        padding = (window[0] // 2, window[1] // 2)
-        maps = F.avg_pool2d(maps, window, 1, padding, count_include_pad=False)
+    length = 2 * radius + 1
+    if launch_bound(maps):
+        for window in ((length, 1), (1, length)):
+            padding = (window[0] // 2, window[1] // 2)
+            maps = F.avg_pool2d(maps, window, 1, padding, count_include_pad=False)
+        return maps
+    for axis, padding in ((-2, (0, 0, radius, radius)), (-1, (radius, radius))):
+        size = maps.shape[axis]
+        at = torch.arange(size, dtype=maps.dtype)
+        count = (at + radius).clamp_max(size - 1) - (at - radius).clamp_min(0) + 1.0
+        maps = _sums(F.pad(maps, padding), length, axis) / (count[:, None] if axis == -2 else count)
     return maps
+
+
+def _sums(values: Tensor, length: int, axis: int) -> Tensor:
+    """Sum each ``length`` consecutive values along an axis by doubling, so in about ``2 log2(length)`` steps.
+
+    ``avg_pool2d`` takes ``length`` steps, on one thread without vector instructions.
+    """
+    count = values.shape[axis] - length + 1
+    total = torch.zeros(())
+    start, block = 0, 1  # ``values`` are sums of ``block`` consecutive ones
+    while True:
+        if length & block:
+            total = total + values.narrow(axis, start, count)
+            start += block
+        if 2 * block > length:
+            return total
+        kept = values.shape[axis] - block
+        values = values.narrow(axis, 0, kept) + values.narrow(axis, block, kept)
+        block *= 2
 
 
 def _means_of_valid(maps: Tensor, valid: Tensor | None) -> Tensor:

@@ -24,7 +24,7 @@ from geodiff_plugin._internal.threads import available_cores
 from geodiff_plugin.cameras import Camera, PosedViews, resized_mask, resized_px, scaled_size
 from geodiff_plugin.geometry import plane_rays, project_rays
 from geodiff_plugin.matching.build import coarse_volume
-from geodiff_plugin.matching.consistency import match_volume
+from geodiff_plugin.matching.consistency import match_volume, window_mean
 
 #: Longer side of the left image for matching, pixels; residuals are in pixels of this grid.
 LONG_SIDE = 832
@@ -49,9 +49,9 @@ _MIN_CONTRAST = 2.0
 _MAX_ROUND_TRIP_PX = 0.5
 # Flow: maximum flow, which only corrects a warp, pixels.
 _MAX_PX = 24.0
-# Windows that spread matches into holes, pixels of the coarse sweep; each has a hundredth of the previous
-# weight.
-_WINDOWS = (3, 7, 15, 31, 63)
+# Radii of the windows that spread matches into holes, pixels of the coarse sweep; each has a hundredth of the
+# weight of the previous one.
+_RADII = (1, 3, 7, 15, 31)
 # Minimum inverse depth, relative to the largest.
 MIN_INVERSE_RATIO = 1e-3
 #: Minimum number of matches for checking a pose.
@@ -504,11 +504,11 @@ def coarse_depth(posed: PosedViews, size: tuple[int, int]) -> Tensor:
     weight = matches.confidence[None] ** 2 + 1e-9
     values = matches.inverse_depth[None] * weight
     above, below = values.clone(), weight.clone()
-    for i, window in enumerate(_WINDOWS):
+    for i, radius in enumerate(_RADII):
         fraction = 100.0 ** -(i + 1)
-        above += fraction * F.avg_pool2d(values, window, 1, window // 2, count_include_pad=False)
-        below += fraction * F.avg_pool2d(weight, window, 1, window // 2, count_include_pad=False)
-    inverse = F.avg_pool2d(above / below, 5, 1, 2, count_include_pad=False)
+        above += fraction * window_mean(values, radius)
+        below += fraction * window_mean(weight, radius)
+    inverse = window_mean(above / below, 2)
     depth_m = 1.0 / inverse.clamp_min(MIN_INVERSE_RATIO * float(inverse.max()))
     return F.interpolate(depth_m.detach().cpu().float(), size, mode="bilinear", align_corners=False)
 

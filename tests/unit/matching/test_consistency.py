@@ -136,8 +136,10 @@ def test_the_plane_is_found_in_metres_and_the_order_of_the_views_does_not_matter
     assert all((each < found.confidence).any() for each in alone)
 
 
-@pytest.mark.parametrize("radius", [1, 4])
-def test_the_mean_of_a_window_counts_what_lies_inside_the_image(radius):
+@pytest.mark.parametrize("by_pooling", ["0", "1"])
+@pytest.mark.parametrize("radius", [0, 1, 4, 15])
+def test_the_mean_of_a_window_counts_what_lies_inside_the_image(radius, by_pooling, monkeypatch):
+    monkeypatch.setenv("TRITON_INTERPRET", by_pooling)
     maps = np.random.default_rng(0).random((2, 3, 7, 11))
     found = window_mean(torch.from_numpy(maps), radius)
     for index in np.ndindex(2, 3):
