@@ -129,7 +129,8 @@ class SampleOptions(EvalOptions):
     )
     limit: int | None = count_of(
         None,
-        "Maximum number of samples, taken from the start of the list (table1, table2, table3, ablation: per dataset).",
+        "Maximum number of samples, taken from the start of the list (table1, table2, table3, ablation: per "
+        "dataset).",
     )
     ensemble: int = count_of(1, "Number of ensemble members.", high=1000, section=PRIOR)
     resolution: int | None = count_of(None, "Longer side of the prior's input in pixels.", 0, 8192, PRIOR)

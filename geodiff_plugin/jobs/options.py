@@ -122,8 +122,12 @@ class RigOptions(RunOptions):
     )
     fx: float | None = _camera(None, "Focal length along x in pixels.")
     fy: float | None = _camera(None, "Focal length along y in pixels (default: --fx).")
-    cx: float | None = _camera(None, "Principal point, x in pixels; the first column's centre is at 0 (default: image centre).")
-    cy: float | None = _camera(None, "Principal point, y in pixels; the first row's centre is at 0 (default: image centre).")
+    cx: float | None = _camera(
+        None, "Principal point, x in pixels; the first column's centre is at 0 (default: image centre)."
+    )
+    cy: float | None = _camera(
+        None, "Principal point, y in pixels; the first row's centre is at 0 (default: image centre)."
+    )
     cx_right: float | None = _camera(None, "cx of the right camera of a rectified pair (default: --cx).")
     k: Path | None = _camera(None, "Intrinsics of the left camera: a 3x3 matrix as text or .npy.", "--K")
     e: Path | None = _camera(
@@ -140,7 +144,9 @@ class RigOptions(RunOptions):
         "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; pass it once for both lenses, or once "
         "per lens.",
     )
-    cropped: bool = _camera(False, "Allow a principal point far from the image centre or outside the image, for crops.")
+    cropped: bool = _camera(
+        False, "Allow a principal point far from the image centre or outside the image, for crops."
+    )
     mask: Path | None = _masks(
         None,
         "Mask of LEFT: white pixels are valid; all others get no depth. For many pairs, one mask or a "
@@ -567,7 +573,12 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
     strict: bool = _output(False, "Exit with code 4 unless every frame is trusted.")
     quiet: bool = _output(False, "Hide the progress bar.", "--quiet", "-q")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
-    processes: int | None = _machines(None, "Number of worker processes (default: on a CPU, as many as cores and memory allow; otherwise 1).", low=1, high=1024)
+    processes: int | None = _machines(
+        None,
+        "Number of worker processes (default: on a CPU, as many as cores and memory allow; otherwise 1).",
+        low=1,
+        high=1024,
+    )
     shard: str | None = _machines(
         None,
         "Process only shard I of N, with I from 0 to N-1. Afterwards, run the same command without --shard "

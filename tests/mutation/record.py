@@ -51,7 +51,8 @@ class Recorder:
         # Not in pytest_unconfigure: pytest-xdist may end its workers before that is done.
         self.coverage.stop()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that lines executed at import, before coverage started, are unknown
+            # Modules that were imported before coverage started are reported, here as an error.
+            warnings.simplefilter("ignore")
             self.coverage.save()
         seconds = {test: self.seconds[test] for test in self.passed}
         (self.folder / f"seconds-{os.getpid()}.json").write_text(json.dumps(seconds), encoding="utf-8")
