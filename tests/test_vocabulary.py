@@ -9,9 +9,10 @@ import io
 import re
 import tokenize
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -138,6 +139,9 @@ TEST_WORDS = {
     "told",
 }
 _PHRASE = {key: re.compile(rf"(?<![\w`/.-]){key}(?![\w/-])", re.IGNORECASE) for key in PHRASES}
+#: Matches wherever one of the phrases does; most texts have none, and one search is faster than one for each.
+_ANY_PHRASE = re.compile(rf"(?<![\w`/.-])(?:{'|'.join(PHRASES)})(?![\w/-])", re.IGNORECASE)
+_TEST_WORD = re.compile(rf"(?<![\w`/.-])(?:{'|'.join(sorted(TEST_WORDS))})(?![\w/-])", re.IGNORECASE)
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 
 
@@ -157,43 +161,43 @@ def pages() -> list[Path]:
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
+class Content(NamedTuple):
+    """What is checked in a module.
+
+    Attributes:
+        identifiers: every name that it defines, uses or passes as a keyword.
+        docstrings: of the module, its classes and functions.
+        messages: strings of several words that are not docstrings: messages, help texts, errors, labels.
+    """
+
+    identifiers: set[str]
+    docstrings: list[str]
+    messages: list[str]
+
+
 @cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-def identifiers(path: Path) -> Iterator[str]:
-    """Every identifier that a module defines, uses or passes as a keyword."""
-    for node in ast.walk(tree_of(path)):
-        for field in ("id", "attr", "arg", "name", "asname"):
-            value = getattr(node, field, None)
-            if isinstance(value, str):
-                yield from value.split(".")
-
-
-def docstrings(path: Path) -> list[ast.Constant]:
-    """The docstring nodes of a module."""
-    found = []
-    for node in ast.walk(tree_of(path)):
+def content(path: Path) -> Content:
+    """Collect what is checked in one walk, because the trees of all modules take seconds and much memory."""
+    identifiers: set[str] = set()
+    texts: dict[int, str] = {}
+    docstrings: dict[int, str] = {}
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        names = (getattr(node, field, None) for field in ("id", "attr", "arg", "name", "asname"))
+        identifiers.update(part for name in names if isinstance(name, str) for part in name.split("."))
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) and node.body:
             first = node.body[0]
             if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                found.append(first.value)
-    return [each for each in found if isinstance(each.value, str)]
-
-
-def messages(path: Path) -> Iterator[str]:
-    """Strings of several words that are not docstrings: messages, help texts, errors, labels."""
-    prose = {id(each) for each in docstrings(path)}
-    for node in ast.walk(tree_of(path)):
-        is_text = isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose
-        if is_text and " " in node.value.strip():
-            yield node.value
+                docstrings[id(first.value)] = first.value.value
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            texts[id(node)] = node.value
+    messages = [text for key, text in texts.items() if key not in docstrings and " " in text.strip()]
+    return Content(identifiers, [text for text in docstrings.values() if isinstance(text, str)], messages)
 
 
 def comments(path: Path) -> Iterator[str]:
     """Docstrings and comments; consecutive comment lines are one text."""
-    yield from (each.value for each in docstrings(path))
+    yield from content(path).docstrings
     text, last = "", 0
     for token in tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline):
         if token.type == tokenize.COMMENT:
@@ -212,21 +216,27 @@ def page_text(path: Path) -> Iterator[str]:
 
 def bad_identifiers(path: Path) -> list[str]:
     """``word: standard term`` of every banned identifier of a module."""
-    found = []
-    for name in sorted(set(identifiers(path)) - IDENTIFIER_EXCEPTIONS):
-        rest = re.sub("ground_?truth", "", name, flags=re.IGNORECASE)
-        words = [word.lower() for word in _WORD.findall(rest)]
-        found += [f"{name}: {IDENTIFIER_WORDS[word]}" for word in words if word in IDENTIFIER_WORDS]
-        found += [f"{name}: {term}" for key, term in IDENTIFIER_PATTERNS.items() if re.fullmatch(key, name)]
-    return found
+    names = sorted(content(path).identifiers - IDENTIFIER_EXCEPTIONS)
+    return [found for name in names for found in bad_words(name)]
 
 
-def bad_phrases(path: Path, texts: Iterator[str]) -> list[str]:
+@cache
+def bad_words(name: str) -> list[str]:
+    """``word: standard term`` of one identifier."""
+    rest = re.sub("ground_?truth", "", name, flags=re.IGNORECASE)
+    words = [word.lower() for word in _WORD.findall(rest)]
+    found = [f"{name}: {IDENTIFIER_WORDS[word]}" for word in words if word in IDENTIFIER_WORDS]
+    return found + [f"{name}: {term}" for key, term in IDENTIFIER_PATTERNS.items() if re.fullmatch(key, name)]
+
+
+def bad_phrases(path: Path, texts: Iterable[str]) -> list[str]:
     """``phrase: standard term`` of every banned phrase of texts."""
     allowed = PHRASE_EXCEPTIONS.get(path.relative_to(ROOT).as_posix(), set())
     found = []
     for text in texts:
         line = " ".join(text.split())
+        if not _ANY_PHRASE.search(line):
+            continue
         for key, pattern in _PHRASE.items():
             if key not in allowed:
                 found += [
@@ -241,12 +251,14 @@ def around(text: str, hit: re.Match[str]) -> str:
 
 def bad_words_of_tests(path: Path) -> list[str]:
     """Banned words in names of tests, docstrings and comments of a module."""
-    names = {name for name in identifiers(path) if name.startswith("test_")}
+    source = path.read_text(encoding="utf-8")
+    names = set(re.findall(r"def (test_\w+)", source))
     found = [f"{word} in {name}" for name in sorted(names) for word in name.split("_") if word in TEST_WORDS]
+    if not _TEST_WORD.search(source):
+        return found
     for text in comments(path):
         line = " ".join(text.split())
-        hits = re.finditer(rf"(?<![\w`/.-])({'|'.join(sorted(TEST_WORDS))})(?![\w/-])", line, re.IGNORECASE)
-        found += [f"{hit[0]} in {around(line, hit)!r}" for hit in hits]
+        found += [f"{hit[0]} in {around(line, hit)!r}" for hit in _TEST_WORD.finditer(line)]
     return found
 
 
@@ -257,7 +269,7 @@ def violations() -> dict[tuple[str, str], list[str]]:
     for path in code_files():
         name = path.relative_to(ROOT).as_posix()
         found["identifier", name] = bad_identifiers(path)
-        found["message", name] = bad_phrases(path, messages(path))
+        found["message", name] = bad_phrases(path, content(path).messages)
         found["comment", name] = bad_phrases(path, comments(path))
     for path in modules_of_tests():
         found["test", path.relative_to(ROOT).as_posix()] = bad_words_of_tests(path)
@@ -294,6 +306,6 @@ def test_every_message_of_a_finding_is_among_the_checked_texts():
     """They are declared as plain strings."""
     from geodiff_plugin.trust import KINDS
 
-    checked = {" ".join(text.split()) for path in code_files() for text in messages(path)}
+    checked = {" ".join(text.split()) for path in code_files() for text in content(path).messages}
     for kind in KINDS.values():
         assert {kind.title, kind.cause, kind.hint} <= checked, kind.code
