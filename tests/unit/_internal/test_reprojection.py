@@ -54,10 +54,13 @@ CAMERAS = [
     (K, pose(at=(0.1, 0.0, 0.0)), SIZE),
     (np.diag([2.5, 2.5, 1]) @ K, pose(2, -3, 4, at=(0.15, -0.05, 0.1)), (400, 300)),
     (np.diag([0.4, 0.4, 1]) @ K, pose(-1, 2, -8, at=(-0.2, 0.05, -0.3)), (64, 48)),
+    (np.array([[90.0, 0, 24.0], [0, 90.0, 69.0], [0, 0, 1]]), pose(at=(0.1, 0.05, 0.0)), (50, 140)),
 ]
 
 
-@pytest.mark.parametrize(("K_to", "E", "size"), CAMERAS, ids=["same", "beside", "finer", "coarser"])
+@pytest.mark.parametrize(
+    ("K_to", "E", "size"), CAMERAS, ids=["same", "translated", "finer", "coarser", "portrait"]
+)
 def test_another_camera_sees_what_rays_hit(K_to, E, size):
     depth = cast(K, np.eye(4), SIZE)[0].astype(np.float32)
     found = depth_in_camera(depth, Camera(K), target(K_to, E, size))

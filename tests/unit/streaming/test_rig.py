@@ -133,6 +133,19 @@ def test_lens_distortion_is_removed_from_every_frame(rig, frame):
         np.testing.assert_allclose(prepared.left, expected, atol=1e-6)
 
 
+def test_views_of_a_rig_may_differ_in_size_and_lens(rig, frame):
+    lens = Distortion("opencv", np.array([-0.2, 0.05, 0.0, 0.0]))
+    right = frame.right[:-6, :-10]
+    mixed = replace(rig, right=replace(rig.right, lens=lens), measured=False)
+    setup = setup_of_rig(mixed, FAST)(frame.left / np.float32(255), right / np.float32(255))
+    assert [camera.size for camera in setup.cameras] == [each.shape[1::-1] for each in (frame.left, right)]
+    expected = prepare.pinhole(right / np.float32(255), setup.cameras[1], FAST)
+    (found,) = setup.guidance.inputs[0].views
+    np.testing.assert_allclose(found.image_01.permute(1, 2, 0), expected, atol=1e-6)
+    measured = setup_of_rig(rig, FAST)(frame.left / np.float32(255), frame.right / np.float32(255))
+    assert measured.guidance.measured_baseline and not setup.guidance.measured_baseline
+
+
 def test_the_evidence_is_found_by_the_call(rig, frame, pipe, monkeypatch):
     prepared = LiveRig(setup_of_rig(rig, FAST), CPU, check_every=2).prepare(frame)
 

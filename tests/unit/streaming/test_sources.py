@@ -66,6 +66,13 @@ def test_a_file_is_played_at_its_rate(tmp_path, views):
     np.testing.assert_array_less([-1e-9, 0.045, 0.095], arrived)
 
 
+def test_two_files_are_played_at_the_rate_of_the_first(tmp_path, views):
+    rates = (20.0, 40.0)
+    videos = [write_video(tmp_path / f"{rate}.avi", views[0], rate) for rate in rates]
+    assert CameraSource(videos)._interval_s == pytest.approx(0.05)
+    assert CameraSource(videos[::-1])._interval_s == pytest.approx(0.025)
+
+
 class Camera:
     """A device that fails at first, delivers some frames, and then is gone."""
 
@@ -116,6 +123,20 @@ def test_two_cameras(cameras, views):
         next(frames)
     source.close()
     assert all(camera.released for camera in cameras.values())
+
+
+def test_only_devices_and_streams_are_waited_for(cameras, views, monkeypatch, tmp_path):
+    waits = []
+    monkeypatch.setattr(sources.time, "sleep", waits.append)
+    monkeypatch.setattr(sources, "RETRY_S", 0.125)
+    cameras[0] = Camera(0, views[0], failures=3)
+    next(iter(CameraSource([0, 0])))
+    assert waits.count(0.125) == 2  # both sources share the device, which is read twice per attempt
+    waits.clear()
+    path = tmp_path / "rig.avi"
+    path.write_bytes(b"-")
+    cameras[str(path)] = Camera("", failures=3)
+    assert list(CameraSource([path])) == [] and waits == []
 
 
 def test_a_stream_is_opened_by_its_url(cameras, views):
