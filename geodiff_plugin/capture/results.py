@@ -160,16 +160,19 @@ class FinishedFrame(NamedTuple):
     unit: str | None  # unit of its depth
 
 
-def write_smoothed(frames: Sequence[FinishedFrame], rgb: Callable[[int], np.ndarray]) -> list[int]:
+def write_smoothed(
+    frames: Sequence[FinishedFrame], rgb: Callable[[int], np.ndarray], holes: Thresholds | None = None
+) -> list[int]:
     """Write the temporally smoothed depth of a video's finished frames; return the scene number of each.
 
     ``rgb(i)`` is ``(H, W, 3)`` in [0, 1]. The depth before smoothing stays in ``ALONE``, so repeating the
-    call changes nothing.
+    call changes nothing. With ``holes``, depths that are not reliable after smoothing are removed.
     """
     scenes = scene_poses((_alone(frame), rgb(i)) for i, frame in enumerate(frames))
     averaged = temporally_smoothed(scenes, lambda i: _alone(frames[i]))
-    for frame, depth in zip(frames, averaged, strict=True):
-        _write_agreed(frame.folder, depth, frame.unit)
+    for frame, smoothed in zip(frames, averaged, strict=True):
+        shown = smoothed if holes is None else with_holes(smoothed, holes)
+        _write_agreed(frame.folder, shown, frame.unit)
     return [number for number, poses in enumerate(scenes) for _ in poses]
 
 

@@ -420,10 +420,8 @@ def test_a_cleared_frame_keeps_the_files_of_others(tmp_path):
             (folder / extra).unlink()
 
 
-def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes_nothing(
-    plain_figures, tmp_path
-):
-    """Depth by a run is kept on first use. The second scene has a frame more than the first."""
+def finished_video(folder):
+    """Five finished frames of the room in two scenes, their images, and their true depth."""
     camera, size = np.array([[150.0, 0, 84.0], [0, 132.0, 68.0], [0, 0, 1]]), (170, 128)
     images, frames, ground_truths = [], [], []
     for i in range(5):
@@ -433,12 +431,20 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
         image, depth = render(E, size, camera)
         images.append(image.astype(np.float32) / 255)
         ground_truths.append(depth)
-        folder = tmp_path / f"f{i}"
-        folder.mkdir()
-        np.save(folder / "depth.npy", (depth * (1 + 0.01 * (-1) ** i)).astype(np.float32))
+        frames.append(FinishedFrame(folder / f"f{i}", camera, "m"))
+        frames[-1].folder.mkdir()
+        np.save(frames[-1].folder / "depth.npy", (depth * (1 + 0.01 * (-1) ** i)).astype(np.float32))
         if i:
-            np.save(folder / "confidence.npy", np.full(depth.shape, 0.1 + 0.2 * i, np.float32))
-        frames.append(FinishedFrame(folder, camera, "m"))
+            confidence = np.full(depth.shape, 0.1 + 0.2 * i, np.float32)
+            np.save(frames[-1].folder / "confidence.npy", confidence)
+    return frames, images, ground_truths
+
+
+def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes_nothing(
+    plain_figures, tmp_path
+):
+    """Depth by a run is kept on first use. The second scene has a frame more than the first."""
+    frames, images, ground_truths = finished_video(tmp_path)
     before = [np.load(frame.folder / "depth.npy") for frame in frames]
     assert results.write_smoothed(frames, images.__getitem__) == [0, 0, 1, 1, 1]
     temporal_smoothing = [np.load(frame.folder / "depth.npy") for frame in frames]
@@ -456,6 +462,41 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
     results.write_smoothed(frames, images.__getitem__)
     for frame, depth in zip(frames, temporal_smoothing, strict=True):
         np.testing.assert_array_equal(np.load(frame.folder / "depth.npy"), depth)
+
+
+def test_depths_that_are_not_reliable_after_smoothing_are_removed(plain_figures, tmp_path):
+    """A wrong depth with a small sigma is replaced by its neighbours', whose sigma is above the limit."""
+    frames, images, _ = finished_video(tmp_path)
+    limits = Thresholds(min_confidence=0.2, max_sigma=0.05)
+    blob = slice(50, 80), slice(60, 100)
+    for frame in frames:
+        depth = np.load(frame.folder / "depth.npy")
+        np.save(frame.folder / "sigma.npy", np.full_like(depth, 0.04))
+        np.save(frame.folder / "confidence.npy", np.full_like(depth, 0.6))
+    depth = np.load(frames[3].folder / "depth.npy")
+    depth[blob] *= 1.5
+    confidence = np.full_like(depth, 0.6)
+    confidence[blob] = 0.4  # the neighbours have more weight
+    np.save(frames[3].folder / "depth.npy", depth)
+    np.save(frames[3].folder / "confidence.npy", confidence)
+
+    def above(frame):
+        depth, sigma = (np.load(frame.folder / f"{name}.npy") for name in ("depth", "sigma"))
+        return (depth > 0) & ~(sigma <= limits.max_sigma)
+
+    results.write_smoothed(frames, images.__getitem__)
+    assert above(frames[3])[blob].mean() > 0.9, "smoothing alone violates the limit"
+    kept = [~above(frame) for frame in frames]
+    results.write_smoothed(frames, images.__getitem__, limits)
+    for frame, mask in zip(frames, kept, strict=True):
+        maps = {name: np.load(frame.folder / f"{name}.npy") for name in ("depth", "confidence", "sigma")}
+        np.testing.assert_array_equal(maps["depth"] > 0, mask)
+        np.testing.assert_array_equal(maps["confidence"] > 0, mask)
+        np.testing.assert_array_equal(np.isnan(maps["sigma"]), ~mask)
+        assert (maps["confidence"][mask] >= limits.min_confidence).all()
+        for name in ("depth_mm", "sigma_mm"):
+            assert not np.asarray(Image.open(frame.folder / f"{name}.png"))[~mask].any()
+        assert (np.load(frame.folder / "depth_alone.npy") > 0).all(), "it is read again"
 
 
 def written(capture: Capture, tmp_path, export=(), not_trusted=()):
