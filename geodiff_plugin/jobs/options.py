@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import MISSING, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from geodiff_plugin._internal.checks import bad_value, check_baseline_m, raise_input_error
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
@@ -40,6 +40,9 @@ from geodiff_plugin.options import (
     check_rules,
 )
 from geodiff_plugin.settings import DEFAULT_SECTION, Affects, check_settings, setting, settings_of
+
+if TYPE_CHECKING:
+    from geodiff_plugin.cameras import PosedCamera
 
 #: Files of a COLMAP model that are read, text files first.
 MODEL_FILES = (("cameras.txt", "images.txt"), ("cameras.bin", "images.bin"))
@@ -83,6 +86,7 @@ RULES = (
     Excludes((*_POSED, "view_e"), _UNPOSED, _FOR_K),
     Excludes(("temporal_smoothing",), _UNPOSED, "each pair would have its own scale"),
     Needs(("cameras",), (Given("calib"),), "it selects cameras of the calibration file"),
+    Needs(("reproject_size",), (Given("reproject"),)),
     Excludes(("disparity",), _POINTS, "pass only one of them"),
     _HOLES,
     Excludes(("holes",), Given("fill"), "it fills every pixel"),
@@ -101,6 +105,16 @@ def unique_names(paths: Collection[Path]) -> list[str]:
     absolute = [path.absolute() for path in paths]
     common = os.path.commonpath([path.parent for path in absolute])
     return [path.relative_to(common).as_posix() for path in absolute]
+
+
+def _size_of(flag: str, text: str | None) -> tuple[int, int] | None:
+    """Parse the ``(width, height)`` of an option; ``None`` if it is not given."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if match is None:
+        bad_value(flag, "WIDTHxHEIGHT in pixels, such as 1344x376", repr(text))
+    return int(match[1]), int(match[2])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,8 +136,12 @@ class RigOptions(RunOptions):
     )
     fx: float | None = _camera(None, "Focal length along x in pixels.")
     fy: float | None = _camera(None, "Focal length along y in pixels (default: --fx).")
-    cx: float | None = _camera(None, "Principal point, x in pixels; the first column's centre is at 0 (default: image centre).")
-    cy: float | None = _camera(None, "Principal point, y in pixels; the first row's centre is at 0 (default: image centre).")
+    cx: float | None = _camera(
+        None, "Principal point, x in pixels; the first column's centre is at 0 (default: image centre)."
+    )
+    cy: float | None = _camera(
+        None, "Principal point, y in pixels; the first row's centre is at 0 (default: image centre)."
+    )
     cx_right: float | None = _camera(None, "cx of the right camera of a rectified pair (default: --cx).")
     k: Path | None = _camera(None, "Intrinsics of the left camera: a 3x3 matrix as text or .npy.", "--K")
     e: Path | None = _camera(
@@ -140,7 +158,9 @@ class RigOptions(RunOptions):
         "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; pass it once for both lenses, or once "
         "per lens.",
     )
-    cropped: bool = _camera(False, "Allow a principal point far from the image centre or outside the image, for crops.")
+    cropped: bool = _camera(
+        False, "Allow a principal point far from the image centre or outside the image, for crops."
+    )
     mask: Path | None = _masks(
         None,
         "Mask of LEFT: white pixels are valid; all others get no depth. For many pairs, one mask or a "
@@ -299,7 +319,14 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     reproject: Path | None = _output(
         None,
         "Also reproject the depth into another camera, described by a JSON file with its K, its pose E in "
-        "the left camera's frame, width and height.",
+        "the left camera's frame, width and height, or into a RealSense's colour camera, described by the "
+        "output of rs-enumerate-devices -c.",
+        affects=RESULT,
+    )
+    reproject_size: str | None = _output(
+        None,
+        "Size of the colour images, as WIDTHxHEIGHT, if the file for --reproject lists several.",
+        metavar="SIZE",
         affects=RESULT,
     )
     strict: bool = _output(
@@ -358,6 +385,13 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
         for path in (*self.image_files().values(), *(path for _, path in self.other_files())):
             files += _files_in(path) if path.is_dir() else [path]
         return files
+
+    def target_camera(self) -> PosedCamera:
+        """Return the camera of ``--reproject``, which must be given."""
+        from geodiff_plugin.formats import read_target_camera  # imports numpy
+
+        assert self.reproject is not None
+        return read_target_camera(self.reproject, _size_of("--reproject-size", self.reproject_size))
 
     def bag_topics(self) -> tuple[str, str]:
         """Return the topics of ``--left-topic`` and ``--right-topic``."""
@@ -439,9 +473,7 @@ def check_files(options: DepthOptions, images: bool = True) -> None:
         if not (name == "calibration" and is_folder):  # missing files of a model are reported later
             check_file(path, name)
     if options.reproject is not None:
-        from geodiff_plugin.formats import read_target_camera  # imports numpy
-
-        read_target_camera(options.reproject)
+        options.target_camera()
 
 
 def with_folder(options: DepthOptions, default: str) -> DepthOptions:
@@ -567,7 +599,12 @@ class CaptureOptions(MachineOptions, SpeedOptions, PriorOptions):
     strict: bool = _output(False, "Exit with code 4 unless every frame is trusted.")
     quiet: bool = _output(False, "Hide the progress bar.", "--quiet", "-q")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
-    processes: int | None = _machines(None, "Number of worker processes (default: on a CPU, as many as cores and memory allow; otherwise 1).", low=1, high=1024)
+    processes: int | None = _machines(
+        None,
+        "Number of worker processes (default: on a CPU, as many as cores and memory allow; otherwise 1).",
+        low=1,
+        high=1024,
+    )
     shard: str | None = _machines(
         None,
         "Process only shard I of N, with I from 0 to N-1. Afterwards, run the same command without --shard "
@@ -677,12 +714,7 @@ class LiveOptions(SpeedOptions, RigOptions):
 
     def frame_size(self) -> tuple[int, int] | None:
         """Return the ``(width, height)`` of ``--size``."""
-        if self.size is None:
-            return None
-        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", self.size)
-        if match is None:
-            bad_value("--size", "WIDTHxHEIGHT in pixels, such as 1344x376", repr(self.size))
-        return int(match[1]), int(match[2])
+        return _size_of("--size", self.size)
 
     def check_all(self) -> None:
         """Check all options that can be checked before a camera is opened."""

@@ -76,7 +76,7 @@ def write_smoothed_frames(
             if options.reproject is not None:
                 depth = valid_depth(result.folder)
                 result.report["reproject"] = write_reprojected(
-                    result.folder, depth, result.frame.K, options.reproject
+                    result.folder, depth, result.frame.K, options.target_camera()
                 )
             result.add(AGREED, temporal_smoothing={"scene": scene})
     except OSError as error:

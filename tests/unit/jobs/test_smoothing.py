@@ -91,7 +91,7 @@ def test_another_camera_sees_the_averaged_depth_where_there_is_one(run, tmp_path
         known = made_runs.depth_map() + n + 0.1
         known[5:7] = 0.0
         K = made_runs.K_LEFT + n * np.diag([1.0, 1.0, 0])
-        reported = write_reprojected(tmp_path, known, K, run["options"].reproject)
+        reported = write_reprojected(tmp_path, known, K, run["options"].target_camera())
         np.testing.assert_array_equal(seen_m, np.load(tmp_path / "depth_reprojected.npy"))
         assert json.loads((folder / "report.json").read_text())["reproject"] == reported
         millimetres = np.asarray(Image.open(folder / "depth_reprojected_mm.png"))
