@@ -36,6 +36,7 @@ from geodiff_plugin.options import (
     Needs,
     PriorOptions,
     RunOptions,
+    ServerOptions,
     SpeedOptions,
     check_rules,
 )
@@ -696,6 +697,11 @@ class LiveOptions(SpeedOptions, RigOptions):
         affects=NOTHING,
     )
     window: bool = _output(False, "Show the left image and the depth in a window (needs opencv-python).")
+    app: bool = _output(
+        False, "Serve a page that shows the newest depth while the command runs (needs the extra 'app')."
+    )
+    host: str = _like(ServerOptions, "host", "127.0.0.1", section=OUTPUT)
+    port: int | None = _like(ServerOptions, "port", None, section=OUTPUT)
     quiet: bool = _output(False, "Print only errors and warnings.", "--quiet", "-q")
     json: bool = _output(False, "Print one line of JSON per result instead of one summary per second.")
 
@@ -734,6 +740,8 @@ class LiveOptions(SpeedOptions, RigOptions):
         self.frame_size()
         if self.out is None:
             self.raise_input_error(("overwrite",), "{} needs --out.")
+        if not self.app:
+            self.raise_input_error(("host", "port"), "{} needs --app.")
         pair = self.as_pair()
         pair.check_all()
         pair.camera_source()
