@@ -161,6 +161,17 @@ class PriorOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ServerOptions:
+    """Address of a page that a command serves."""
+
+    host: str = setting(
+        "127.0.0.1",
+        "Address to listen on; 0.0.0.0 accepts connections from other machines, without a password.",
+    )
+    port: int | None = setting(None, "Port (default: first free port).", low=1, high=65535)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SpeedOptions:
     """Options for running networks and stages on a GPU. Results are equal within rounding."""
 

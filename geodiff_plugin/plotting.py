@@ -39,6 +39,8 @@ FRACTION_COLOURS = "YlGnBu_r"
 GREY = 128
 #: Number of colours in a colour map, more than an 8-bit image can show.
 SHADES = 1024
+#: Fraction of the colour range of the previous frame of a video that is kept.
+KEPT_RANGE = 0.9
 #: Percentage of pixels beyond either end of the colours, so that outliers do not compress the rest.
 TAIL_PERCENT = 2.0
 #: Maximum number of pixels that determine the ends of the colours, of a map or of all maps of a video.
@@ -90,6 +92,21 @@ def depth_range(depth_m: Any, near: float | None = None, far: float | None = Non
     if high <= low * (1 + 1e-6):  # a flat map, or a given end beyond the data: widen the other end slightly
         low, high = (low, low * 1.01) if far is None else (high / 1.01, high)
     return float(low), float(high)
+
+
+class SmoothedRange:
+    """The range of the colours of a video, which changes slowly, so that colours do not flicker."""
+
+    def __init__(self) -> None:
+        self._range: np.ndarray | None = None
+
+    def update(self, depth_m: np.ndarray) -> tuple[float | None, float | None]:
+        """Include the depth of the next frame; return near and far, ``None`` before any depth is known."""
+        if (depth_m > 0).any():
+            current = np.array(depth_range(depth_m))
+            kept = current if self._range is None else self._range
+            self._range = KEPT_RANGE * kept + (1 - KEPT_RANGE) * current
+        return (None, None) if self._range is None else (float(self._range[0]), float(self._range[1]))
 
 
 def ticks(near: float, far: float, most: int = 8) -> list[float]:

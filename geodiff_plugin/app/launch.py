@@ -11,7 +11,8 @@ import signal
 import sys
 import tempfile
 import threading
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -130,6 +131,59 @@ def _new_locked_folder() -> str:
     return str(hidden.rename(hidden.with_name(hidden.name.removeprefix("."))))
 
 
+def prepare_server() -> None:
+    """Give a server its own folder, before gradio is imported, which reads where it is.
+
+    Raises:
+        InputError: gradio is not installed.
+    """
+    if importlib.util.find_spec("gradio") is None:
+        hint = "Install it with: pip install 'geodiff-plugin[app]'."
+        raise_input_error(f"The web app needs gradio, which is not installed. {hint}")
+    os.environ.update(QUIET)  # gradio reads these when it is imported
+    _remove_leftovers()
+    os.environ["GRADIO_TEMP_DIR"] = tempfile.tempdir = _new_folder()
+
+
+def launch_blocks(page: Any, **options: Any) -> Any:
+    """Launch a page with the theme and limits of all pages; cross-site requests are rejected.
+
+    ``options`` are further arguments of ``gradio.Blocks.launch``.
+    """
+    from starlette.middleware import Middleware
+
+    from geodiff_plugin.app.page import THEME
+    from geodiff_plugin.app.templates import CSS
+
+    return page.queue(max_size=QUEUE, default_concurrency_limit=8).launch(
+        theme=THEME,
+        css=CSS,
+        state_session_capacity=MAX_SESSIONS,
+        max_file_size=MAX_FILE_SIZE,
+        footer_links=[],
+        app_kwargs={"middleware": [Middleware(_Guard)]},
+        quiet=True,
+        **options,
+    )
+
+
+@contextmanager
+def address_errors(host: str, port: int | None) -> Iterator[None]:
+    """Convert the error for an address that cannot be used to a message with its options."""
+    try:
+        yield
+    except OSError as error:
+        if "empty port" not in str(error):
+            raise
+        got = f"{host} and {port or 'no free port'}, which is in use or not an address of this machine"
+        bad_value(
+            "--host and --port",
+            "an address with a free port",
+            got,
+            "Choose a different port, or omit --port.",
+        )
+
+
 def launch_page(
     priors: tuple[str, ...] = ("bundled",), device: str = "auto", dtype: str = "float32", **options: Any
 ) -> Any:
@@ -138,17 +192,9 @@ def launch_page(
     Visitors choose among ``priors``, names accepted by ``load_prior``; the first is the default. ``dtype`` is
     the precision of their weights.
     """
-    if importlib.util.find_spec("gradio") is None:
-        hint = "Install it with: pip install 'geodiff-plugin[app]'."
-        raise_input_error(f"geodiff app needs gradio, which is not installed. {hint}")
-    os.environ.update(QUIET)  # gradio reads these when it is imported
-    _remove_leftovers()
-    os.environ["GRADIO_TEMP_DIR"] = tempfile.tempdir = _new_folder()
-    from starlette.middleware import Middleware
-
+    prepare_server()
     from geodiff_plugin.app.job import EXAMPLES, Priors, results_folder
-    from geodiff_plugin.app.page import THEME, build_page
-    from geodiff_plugin.app.templates import CSS
+    from geodiff_plugin.app.page import build_page
     from geodiff_plugin.runtime.machine import pick_device
 
     offered = Priors(priors, pick_device(device), dtype)
@@ -157,18 +203,8 @@ def launch_page(
     viewer = Path(__file__).with_name("viewer.js").read_text(encoding="utf-8")
     results_folder().mkdir()
     served = [results_folder(), *(example.folder for example in EXAMPLES)]
-    return page.queue(max_size=QUEUE, default_concurrency_limit=8).launch(
-        theme=THEME,
-        css=CSS,
-        head=f"<script>{viewer}</script>",
-        allowed_paths=[str(path) for path in served],
-        state_session_capacity=MAX_SESSIONS,
-        max_file_size=MAX_FILE_SIZE,
-        footer_links=[],
-        app_kwargs={"middleware": [Middleware(_Guard)]},
-        quiet=True,
-        **options,
-    )
+    scripts = {"head": f"<script>{viewer}</script>", "allowed_paths": [str(path) for path in served]}
+    return launch_blocks(page, **scripts, **options)
 
 
 def run_app(
@@ -181,18 +217,8 @@ def run_app(
             hint = "pip install 'geodiff-plugin[app]'"
             print(f"Without {package}, {purpose} is unavailable. Install it with: {hint}", file=sys.stderr)
     where = {"server_name": host, "server_port": port, "inbrowser": browser, "share": False}
-    try:
+    with address_errors(host, port):
         _, address, _ = launch_page(prior, device, dtype, **where, prevent_thread_lock=True)
         print(f"Serving on {address} (Ctrl-C stops the server)", flush=True)
         with suppress(KeyboardInterrupt):
             threading.Event().wait()
-    except OSError as error:
-        if "empty port" not in str(error):
-            raise
-        got = f"{host} and {port or 'no free port'}, which is in use or not an address of this machine"
-        bad_value(
-            "--host and --port",
-            "an address with a free port",
-            got,
-            "Choose a different port, or omit --port.",
-        )

@@ -69,7 +69,7 @@ BLOCKS = 10_000
 #: Number of frames after which points are merged, so that a long capture fits in memory.
 MERGED_AFTER = 20
 #: Columns of the cloud.
-VERTEX = (*"xyz", "nx", "ny", "nz", "red", "green", "blue")
+VERTEX = (*"xyz", "nx", "ny", "nz", "red", "green", "blue", "sigma")
 
 
 def _frame(capture: Capture, out: Path, maps: Mapping[str, str], name: str) -> DepthFrame:
@@ -160,16 +160,19 @@ class FinishedFrame(NamedTuple):
     unit: str | None  # unit of its depth
 
 
-def write_smoothed(frames: Sequence[FinishedFrame], rgb: Callable[[int], np.ndarray]) -> list[int]:
+def write_smoothed(
+    frames: Sequence[FinishedFrame], rgb: Callable[[int], np.ndarray], holes: Thresholds | None = None
+) -> list[int]:
     """Write the temporally smoothed depth of a video's finished frames; return the scene number of each.
 
     ``rgb(i)`` is ``(H, W, 3)`` in [0, 1]. The depth before smoothing stays in ``ALONE``, so repeating the
-    call changes nothing.
+    call changes nothing. With ``holes``, depths that are not reliable after smoothing are removed.
     """
     scenes = scene_poses((_alone(frame), rgb(i)) for i, frame in enumerate(frames))
     averaged = temporally_smoothed(scenes, lambda i: _alone(frames[i]))
-    for frame, depth in zip(frames, averaged, strict=True):
-        _write_agreed(frame.folder, depth, frame.unit)
+    for frame, smoothed in zip(frames, averaged, strict=True):
+        shown = smoothed if holes is None else with_holes(smoothed, holes)
+        _write_agreed(frame.folder, shown, frame.unit)
     return [number for number, poses in enumerate(scenes) for _ in poses]
 
 
@@ -230,8 +233,9 @@ def write_results(
     """
     to_confirm = frozenset(doubted) if len(doubted) < len(names) else frozenset()
     load = partial(_exported_frame, capture, out, thresholds, to_confirm)
-    cloud, normals = fuse(names, load, capture.image)
-    _write_cloud(capture, out, names, cloud, normals)
+    fused = fuse(names, load, capture.image)
+    cloud = fused.cloud
+    _write_cloud(capture, out, names, fused)
     if "mesh" in export:
         write_mesh(out / "mesh.ply", names, load, capture.image)
     if "colmap" in export:
@@ -262,11 +266,10 @@ def _exported_frame(
     return frame
 
 
-def _write_cloud(
-    capture: Capture, out: Path, names: Sequence[str], cloud: Cloud, normals: np.ndarray
-) -> None:
-    """Write a fused cloud as PLY with its normals, and as GLB with the cameras of the frames."""
-    columns = (cloud.points_m, normals, cloud.colours)
+def _write_cloud(capture: Capture, out: Path, names: Sequence[str], fused: FusedCloud) -> None:
+    """Write a fused cloud as PLY with normals and sigma, and as GLB with the cameras of the frames."""
+    cloud = fused.cloud
+    columns = (cloud.points_m, fused.normals, cloud.colours, fused.sigma[:, None])
     write_vertices(
         out / "cloud.ply",
         frame="world frame",
@@ -362,28 +365,44 @@ def kept(frame: DepthFrame) -> np.ndarray:
     return good
 
 
+class FusedCloud(NamedTuple):
+    """A cloud of ``N`` points in the world frame, with a normal and a standard deviation per point."""
+
+    cloud: Cloud
+    normals: np.ndarray  # (N, 3), of length 1
+    sigma: np.ndarray  # (N,) in the unit of the depth; NaN if a depth of the cell has none
+
+
 def fuse(
     names: Sequence[str], load: Callable[[str], DepthFrame], image: Callable[[str], np.ndarray]
-) -> tuple[Cloud, np.ndarray]:
-    """Fuse all frames into one cloud in the world frame, one point per cell, with ``(N, 3)`` normals.
+) -> FusedCloud:
+    """Fuse all frames into one cloud in the world frame, one point per cell.
 
-    ``load`` returns the agreed frame of a name, ``image`` its ``(H, W, 3)`` in [0, 1].
+    ``load`` returns the agreed frame of a name, ``image`` its ``(H, W, 3)`` in [0, 1]. A point is the mean of
+    the points in its cell, and its ``sigma`` is the mean of theirs, with the same weights. This is an upper
+    bound of the mean's standard deviation, reached if all errors are fully correlated. Independent errors
+    would allow a smaller value, but pose errors are common to the pixels of a frame.
     """
     cell = CELL_FRACTION * _median_depth(map(load, names))
-    every_point = np.zeros((0, 9))
+    every_point = np.zeros((0, 10))
     parts = list[np.ndarray]()
     for number, name in enumerate(names, 1):
-        frame = load(name)
-        mask = kept(frame)
-        normals = normals_of(frame.depth, frame.camera)[mask] @ frame.camera.E[:3, :3].T
-        rows = np.hstack([frame.world()[mask], normals, image(name)[mask] * 255])
+        rows = _points_of(load(name), image(name))
         parts.append(_thinned(rows[:: max(1, len(rows) // MAX_POINTS)], cell))
         if number % MERGED_AFTER == 0 or number == len(names):
             every_point = _thinned(np.concatenate([every_point, *parts]), cell)
             parts = []
-    normals = every_point[:, 3:6]
+    points, normals, colours, sigma = np.split(every_point, (3, 6, 9), axis=1)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return Cloud(every_point[:, :3], np.rint(every_point[:, 6:]).astype(np.uint8)), normals
+    return FusedCloud(Cloud(points, np.rint(colours).astype(np.uint8)), normals, sigma[:, 0])
+
+
+def _points_of(frame: DepthFrame, image: np.ndarray) -> np.ndarray:
+    """Return the kept points of a frame, ``(N, 10)``: position, normal, colour in 255ths, sigma."""
+    mask = kept(frame)
+    normals = normals_of(frame.depth, frame.camera)[mask] @ frame.camera.E[:3, :3].T
+    sigma = np.full(frame.depth.shape, np.nan) if frame.sigma is None else frame.sigma
+    return np.hstack([frame.world()[mask], normals, image[mask] * 255, sigma[mask, None]])
 
 
 def _median_depth(frames: Iterable[DepthFrame]) -> float:

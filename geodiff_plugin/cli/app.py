@@ -31,6 +31,7 @@ from geodiff_plugin.options import (
     SPACES,
     Command,
     PriorOptions,
+    ServerOptions,
     SpeedOptions,
 )
 from geodiff_plugin.settings import setting, settings_of
@@ -170,15 +171,10 @@ class _Merge:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Page:
+class _Page(ServerOptions):
     prior: tuple[str, ...] = setting(("bundled",), "Prior to offer in the web app; repeatable.")
     device: str = setting("auto", settings_of(PriorOptions)["device"].help)
     dtype: str = setting("float32", settings_of(PriorOptions)["dtype"].help, choices=DTYPES)
-    host: str = setting(
-        "127.0.0.1",
-        "Address to listen on; 0.0.0.0 accepts connections from other machines, without a password.",
-    )
-    port: int | None = setting(None, "Port (default: first free port).", low=1, high=65535)
     browser: bool = setting(False, "Open the web app in a browser.")
 
 

@@ -1,4 +1,4 @@
-"""Run ``geodiff live`` and print rate, latency and depth while it runs; show the depth in a window."""
+"""Run ``geodiff live``: print rate, latency and depth while it runs; show the depth in a window or a page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import math
 import time
 from contextlib import AbstractContextManager, ExitStack, closing
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,17 +16,19 @@ from geodiff_plugin.jobs import (
     LiveMeter,
     LiveOptions,
     LiveResult,
+    Notify,
     collected_warnings,
     live_results,
     say,
     silent,
 )
-from geodiff_plugin.plotting import as_rgb_image, colour_depth, depth_range
+from geodiff_plugin.plotting import SmoothedRange, as_rgb_image, colour_depth
+
+if TYPE_CHECKING:
+    from geodiff_plugin.app.live import LivePage
 
 #: Seconds from one printed line to the next.
 PRINT_EVERY_S = 1.0
-#: Fraction of the colour range of the previous frame that is kept, so that colours do not flicker.
-KEPT_RANGE = 0.9
 #: Keys that close the window: q and Escape.
 CLOSING_KEYS = (ord("q"), 27)
 
@@ -34,25 +36,49 @@ CLOSING_KEYS = (ord("q"), 27)
 def run_live(options: LiveOptions) -> None:
     """Process frames until the source ends, Ctrl-C is pressed or the window is closed; print the totals."""
     meter = LiveMeter()
-    printed = -math.inf
+    notify = silent if options.quiet else say
     with collected_warnings(), ExitStack() as stack:
         window = stack.enter_context(_Window("geodiff live")) if options.window else None
-        notify = silent if options.quiet else say
+        page = stack.enter_context(_served_page(options, notify)) if options.app else None
         results = stack.enter_context(closing(live_results(options, notify=notify)))
+        printer = _Printer(options)
         try:
             for result in results:
                 meter.add(result)
-                if options.json:
-                    print(json.dumps(result.row | {"rate_hz": _number(meter.rate_hz)}), flush=True)
-                elif not options.quiet and time.perf_counter() - printed >= PRINT_EVERY_S:
-                    printed = time.perf_counter()
-                    print(line_of(result, meter.rate_hz), flush=True)
+                printer.result(result, meter.rate_hz)
+                if page is not None:
+                    page.show(result, line_of(result, meter.rate_hz))
                 if window is not None and not window.show(result):
                     break
         except KeyboardInterrupt:  # the usual end of a run with a camera
             pass
     if not (options.quiet or options.json):
         print(totals_line(meter.totals()))
+
+
+def _served_page(options: LiveOptions, notify: Notify) -> LivePage:
+    """Serve the page of ``--app``."""
+    from geodiff_plugin.app.live import LivePage  # imports the web app
+
+    page = LivePage(options.host, options.port)
+    notify(f"Serving on {page.address} (Ctrl-C stops the command)")
+    return page
+
+
+class _Printer:
+    """Prints results as lines of JSON, or at most one summary per second."""
+
+    def __init__(self, options: LiveOptions) -> None:
+        self._options = options
+        self._printed = -math.inf
+
+    def result(self, result: LiveResult, rate_hz: float) -> None:
+        """Print a result and the current rate."""
+        if self._options.json:
+            print(json.dumps(result.row | {"rate_hz": _number(rate_hz)}), flush=True)
+        elif not self._options.quiet and time.perf_counter() - self._printed >= PRINT_EVERY_S:
+            self._printed = time.perf_counter()
+            print(line_of(result, rate_hz), flush=True)
 
 
 def line_of(result: LiveResult, rate_hz: float) -> str:
@@ -86,7 +112,7 @@ class _Window(AbstractContextManager["_Window"]):
 
     def __init__(self, title: str) -> None:
         self._title = title
-        self._range_m: np.ndarray | None = None
+        self._range = SmoothedRange()
         try:
             cv2.namedWindow(title, cv2.WINDOW_NORMAL)
         except cv2.error:
@@ -100,11 +126,7 @@ class _Window(AbstractContextManager["_Window"]):
 
     def show(self, result: LiveResult) -> bool:
         """Show a result; ``False`` if the user closed the window."""
-        if (result.depth_m > 0).any():
-            current = np.array(depth_range(result.depth_m))
-            kept = current if self._range_m is None else self._range_m
-            self._range_m = KEPT_RANGE * kept + (1 - KEPT_RANGE) * current
-        near, far = (None, None) if self._range_m is None else self._range_m
+        near, far = self._range.update(result.depth_m)
         shown = np.hstack(
             [np.asarray(as_rgb_image(result.frame.left)), colour_depth(result.depth_m, near, far)]
         )

@@ -12,8 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin.cameras import Size
 from geodiff_plugin.formats.maps import MM_PER_METRE
 from geodiff_plugin.formats.rigs import (
+    DISTORTION_TOLERANCE,
     CameraChoice,
     RawCamera,
     array_of,
@@ -34,12 +36,11 @@ ZED_SIZES = {
 #: Coefficients in OpenCV's order, for its models with 5 and with 8 of them.
 ZED_LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 RS_PRINTED = r'^\s*Intrinsic of "'
-RS_INTRINSIC = re.compile(
-    r'^\s*Intrinsic of "Infrared ([12])" */ *\d+x\d+[^\n]*\n(.*?)(?=\n\s*\n|\Z)', re.M | re.S
-)
-RS_EXTRINSIC = re.compile(
-    r'^\s*Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)', re.M | re.S
-)
+#: Entries of a camera at one resolution, and of the transform between two cameras.
+RS_INTRINSIC = r'^\s*Intrinsic of "{}" */ *\d+x\d+[^\n]*\n(.*?)(?=\n\s*\n|\Z)'
+RS_EXTRINSIC = r'^\s*Extrinsic from "{}"\s+To\s+"{}"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)'
+#: Names of the infrared pair, left first, and of the colour camera.
+RS_PAIR, RS_COLOUR = ("Infrared 1", "Infrared 2"), "Color"
 #: Matches names outside the infrared pair, in lower case; the depth map belongs to its left camera.
 RS_OTHERS = re.compile(r"colou?r|rgb|depth|gyro|accel|imu|confidence")
 #: Keys of the baseline in metres.
@@ -104,19 +105,61 @@ class _Pair(NamedTuple):
 
 
 def _rs_printed(text: str, choice: CameraChoice) -> _Pair:
-    """Parse the output of ``rs-enumerate-devices -c``, which contains every resolution."""
-    cameras: dict[str, dict[tuple[int, int], RawCamera]] = {"1": {}, "2": {}}
-    for side, block in RS_INTRINSIC.findall(text):
+    """Parse the infrared pair in the output of ``rs-enumerate-devices -c``."""
+    left, right = (of_size(_rs_cameras(text, name), choice) for name in RS_PAIR)
+    return _Pair(left, right, _rs_between(text, *RS_PAIR))
+
+
+def _rs_cameras(text: str, name: str) -> dict[Size, RawCamera]:
+    """Parse a camera at every resolution in the output of ``rs-enumerate-devices -c``."""
+    cameras = dict[Size, RawCamera]()
+    for block in re.findall(RS_INTRINSIC.format(name), text, re.M | re.S):
         pairs = (line.partition(":") for line in block.splitlines())
         values: Entries = {key.strip().lower(): value.strip() for key, _, value in pairs}
         values |= {"coeffs": NUMBER.findall(values.get("coeffs", "")), "model": values.get("distortion")}
         size = int(values["width"]), int(values["height"])
-        cameras[side].setdefault(size, _rs_camera(values))  # a size is listed once for every pixel format
-    left, right = (of_size(cameras[side], choice) for side in ("1", "2"))
-    extrinsics = RS_EXTRINSIC.search(text)
+        cameras.setdefault(size, _rs_camera(values))  # a size is listed once for every pixel format
+    return cameras
+
+
+def _rs_between(text: str, source: str, target: str) -> np.ndarray:
+    """Parse the transform ``(4, 4)`` from one camera's frame to another's, in metres."""
+    extrinsics = re.search(RS_EXTRINSIC.format(source, target), text, re.M | re.S)
     rotation, _, translation = (extrinsics[1] if extrinsics else "").partition("Translation")
-    T = transform(NUMBER.findall(rotation)[:9], NUMBER.findall(translation)[:3], "the extrinsics")
-    return _Pair(left, right, T)
+    return transform(NUMBER.findall(rotation)[:9], NUMBER.findall(translation)[:3], "the extrinsics")
+
+
+def is_realsense_text(text: str) -> bool:
+    """Whether a text is the output of ``rs-enumerate-devices -c``."""
+    return re.search(RS_PRINTED, text, re.MULTILINE) is not None
+
+
+def realsense_colour(text: str, size: Size | None) -> tuple[np.ndarray, np.ndarray, Size]:
+    """Parse the colour camera in the output of ``rs-enumerate-devices -c``.
+
+    Source: ``print`` of ``rs2_extrinsics`` in ``tools/enumerate-devices/rs-enumerate-devices.cpp`` of
+    IntelRealSense/librealsense, which prints rotations row by row.
+
+    Args:
+        text: the output.
+        size: ``(width, height)`` of the colour images; may be ``None`` if the text has only one.
+
+    Returns:
+        ``K (3, 3)`` pixels, the pose ``(4, 4)`` in the left infrared camera's frame, and the size.
+    """
+    cameras = _rs_cameras(text, RS_COLOUR)
+    if size is None and len(cameras) == 1:
+        (size,) = cameras
+    if size is None or size not in cameras:
+        sizes = ", ".join("{}x{}".format(*each) for each in sorted(cameras)) or "none"
+        got = "no size" if size is None else "{}x{}".format(*size)
+        bad_value("--reproject-size", f"a size of the colour images in the file ({sizes})", got)
+    camera = cameras[size]
+    if np.abs(camera.coefficients).max(initial=0.0) > DISTORTION_TOLERANCE:
+        hint = "Undistort the colour images, and pass their K, E, width and height as JSON."
+        bad_value("the colour camera", "without lens distortion", f"coefficients {camera.coefficients}", hint)
+    K = array_of(camera.K, (3, 3), "K of the colour camera")
+    return K, np.linalg.inv(_rs_between(text, RS_PAIR[0], RS_COLOUR)), size
 
 
 def _rs_json(text: str) -> _Pair:
@@ -163,7 +206,7 @@ def _of_pair(named: list[tuple[str, Entries]], count: int) -> list[Entries]:
 
 def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """Read the infrared pair, whose images the camera rectifies, or the T265's fisheyes."""
-    printed = re.search(RS_PRINTED, texts[0], re.MULTILINE)
+    printed = is_realsense_text(texts[0])
     left, right, T = _rs_printed(texts[0], choice) if printed else _rs_json(texts[0])
     return make_rig(left, right, np.linalg.inv(T), rectified=True)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._internal.checks import bad_value
-from geodiff_plugin.formats import check_new_file, frame_of_target, read_target_camera, recordings, write_text
+from geodiff_plugin.formats import check_new_file, frame_of_target, recordings, write_text
 from geodiff_plugin.jobs.camera_sources import given_camera_options
 from geodiff_plugin.jobs.finished import Row
 from geodiff_plugin.jobs.many import depth_pairs
@@ -57,7 +57,7 @@ def depth_bag(options: DepthOptions, *, notify: Notify = silent, progress: bool 
     refs = start_many(options, notify)
     rows = depth_pairs(options, refs, notify=notify, progress=progress)
 
-    camera = None if options.reproject is None else read_target_camera(options.reproject)
+    camera = None if options.reproject is None else options.target_camera()
 
     def results() -> Iterator[recordings.BagFrame]:
         for ref, (stamp, _) in zip(refs, pairs, strict=True):

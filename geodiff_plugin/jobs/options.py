@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import MISSING, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from geodiff_plugin._internal.checks import bad_value, check_baseline_m, raise_input_error
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
@@ -36,10 +36,14 @@ from geodiff_plugin.options import (
     Needs,
     PriorOptions,
     RunOptions,
+    ServerOptions,
     SpeedOptions,
     check_rules,
 )
 from geodiff_plugin.settings import DEFAULT_SECTION, Affects, check_settings, setting, settings_of
+
+if TYPE_CHECKING:
+    from geodiff_plugin.cameras import PosedCamera
 
 #: Files of a COLMAP model that are read, text files first.
 MODEL_FILES = (("cameras.txt", "images.txt"), ("cameras.bin", "images.bin"))
@@ -83,6 +87,7 @@ RULES = (
     Excludes((*_POSED, "view_e"), _UNPOSED, _FOR_K),
     Excludes(("temporal_smoothing",), _UNPOSED, "each pair would have its own scale"),
     Needs(("cameras",), (Given("calib"),), "it selects cameras of the calibration file"),
+    Needs(("reproject_size",), (Given("reproject"),)),
     Excludes(("disparity",), _POINTS, "pass only one of them"),
     _HOLES,
     Excludes(("holes",), Given("fill"), "it fills every pixel"),
@@ -101,6 +106,16 @@ def unique_names(paths: Collection[Path]) -> list[str]:
     absolute = [path.absolute() for path in paths]
     common = os.path.commonpath([path.parent for path in absolute])
     return [path.relative_to(common).as_posix() for path in absolute]
+
+
+def _size_of(flag: str, text: str | None) -> tuple[int, int] | None:
+    """Parse the ``(width, height)`` of an option; ``None`` if it is not given."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if match is None:
+        bad_value(flag, "WIDTHxHEIGHT in pixels, such as 1344x376", repr(text))
+    return int(match[1]), int(match[2])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -305,7 +320,14 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     reproject: Path | None = _output(
         None,
         "Also reproject the depth into another camera, described by a JSON file with its K, its pose E in "
-        "the left camera's frame, width and height.",
+        "the left camera's frame, width and height, or into a RealSense's colour camera, described by the "
+        "output of rs-enumerate-devices -c.",
+        affects=RESULT,
+    )
+    reproject_size: str | None = _output(
+        None,
+        "Size of the colour images, as WIDTHxHEIGHT, if the file for --reproject lists several.",
+        metavar="SIZE",
         affects=RESULT,
     )
     strict: bool = _output(
@@ -364,6 +386,13 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
         for path in (*self.image_files().values(), *(path for _, path in self.other_files())):
             files += _files_in(path) if path.is_dir() else [path]
         return files
+
+    def target_camera(self) -> PosedCamera:
+        """Return the camera of ``--reproject``, which must be given."""
+        from geodiff_plugin.formats import read_target_camera  # imports numpy
+
+        assert self.reproject is not None
+        return read_target_camera(self.reproject, _size_of("--reproject-size", self.reproject_size))
 
     def bag_topics(self) -> tuple[str, str]:
         """Return the topics of ``--left-topic`` and ``--right-topic``."""
@@ -445,9 +474,7 @@ def check_files(options: DepthOptions, images: bool = True) -> None:
         if not (name == "calibration" and is_folder):  # missing files of a model are reported later
             check_file(path, name)
     if options.reproject is not None:
-        from geodiff_plugin.formats import read_target_camera  # imports numpy
-
-        read_target_camera(options.reproject)
+        options.target_camera()
 
 
 def with_folder(options: DepthOptions, default: str) -> DepthOptions:
@@ -670,6 +697,11 @@ class LiveOptions(SpeedOptions, RigOptions):
         affects=NOTHING,
     )
     window: bool = _output(False, "Show the left image and the depth in a window (needs opencv-python).")
+    app: bool = _output(
+        False, "Serve a page that shows the newest depth while the command runs (needs the extra 'app')."
+    )
+    host: str = _like(ServerOptions, "host", "127.0.0.1", section=OUTPUT)
+    port: int | None = _like(ServerOptions, "port", None, section=OUTPUT)
     quiet: bool = _output(False, "Print only errors and warnings.", "--quiet", "-q")
     json: bool = _output(False, "Print one line of JSON per result instead of one summary per second.")
 
@@ -688,12 +720,7 @@ class LiveOptions(SpeedOptions, RigOptions):
 
     def frame_size(self) -> tuple[int, int] | None:
         """Return the ``(width, height)`` of ``--size``."""
-        if self.size is None:
-            return None
-        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", self.size)
-        if match is None:
-            bad_value("--size", "WIDTHxHEIGHT in pixels, such as 1344x376", repr(self.size))
-        return int(match[1]), int(match[2])
+        return _size_of("--size", self.size)
 
     def check_all(self) -> None:
         """Check all options that can be checked before a camera is opened."""
@@ -713,6 +740,8 @@ class LiveOptions(SpeedOptions, RigOptions):
         self.frame_size()
         if self.out is None:
             self.raise_input_error(("overwrite",), "{} needs --out.")
+        if not self.app:
+            self.raise_input_error(("host", "port"), "{} needs --app.")
         pair = self.as_pair()
         pair.check_all()
         pair.camera_source()

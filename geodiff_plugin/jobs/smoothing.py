@@ -20,7 +20,7 @@ from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef, options_of
 from geodiff_plugin.jobs.reading import read_pair
 from geodiff_plugin.jobs.report import read_report, valid_depth
-from geodiff_plugin.jobs.writing import write_reprojected
+from geodiff_plugin.jobs.writing import thresholds, write_reprojected
 
 
 @dataclass
@@ -69,12 +69,14 @@ def write_smoothed_frames(
 
     try:
         with warnings.catch_warnings(action="ignore"):  # the run of the pair has issued them
-            scenes = write_smoothed([result.frame for result in results], image)
+            # Smoothing may replace a depth by one with a larger sigma, so the thresholds apply again.
+            holes = thresholds(options) if options.holes else None
+            scenes = write_smoothed([result.frame for result in results], image, holes)
         for result, scene in zip(results, scenes, strict=True):
             if options.reproject is not None:
                 depth = valid_depth(result.folder)
                 result.report["reproject"] = write_reprojected(
-                    result.folder, depth, result.frame.K, options.reproject
+                    result.folder, depth, result.frame.K, options.target_camera()
                 )
             result.add(AGREED, temporal_smoothing={"scene": scene})
     except OSError as error:

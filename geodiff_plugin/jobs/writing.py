@@ -13,7 +13,7 @@ from geodiff_plugin._internal.reprojection import depth_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
 from geodiff_plugin.capture.results import Thresholds
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.formats import REPORT, HeldFolder, OutFolder, in_8_bits, read_target_camera, save_png
+from geodiff_plugin.formats import REPORT, HeldFolder, OutFolder, in_8_bits, save_png
 from geodiff_plugin.jobs.finished import Row, row_of
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, LiveOptions, unique_names
@@ -45,7 +45,7 @@ def write_pair(folder: OutFolder | HeldFolder, run: PairRun, max_points: int | N
             if options.reproject is not None:
                 depth_m = single_map(output.prediction * output.valid)
                 K = np.asarray(output.K)[0].astype(np.float64)
-                report["reproject"] = write_reprojected(place, depth_m, K, options.reproject)
+                report["reproject"] = write_reprojected(place, depth_m, K, options.target_camera())
             if options.export:
                 write_exports(place, output, inputs, options, max_points)
         report["files"]["names"] = [*sorted(path.name for path in place.iterdir()), REPORT]
@@ -159,9 +159,10 @@ def _save_figure(figure: Image.Image, path: Path) -> Image.Image:
     return plotting.shrunk(figure)
 
 
-def write_reprojected(folder: Path, depth_m: np.ndarray, K: np.ndarray, path: Path) -> dict[str, Any]:
+def write_reprojected(
+    folder: Path, depth_m: np.ndarray, K: np.ndarray, camera: PosedCamera
+) -> dict[str, Any]:
     """Write a depth map ``(H, W)`` in the camera of ``--reproject``; return its report entry."""
-    camera = read_target_camera(path)
     seen_m = depth_in_camera(depth_m, Camera(K), camera)
     formats.write_depth_npy(folder / REPROJECTED_FILES[0], seen_m)
     formats.write_depth_mm(folder / REPROJECTED_FILES[1], seen_m)

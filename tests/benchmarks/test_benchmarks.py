@@ -11,7 +11,7 @@ import torch
 from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from tests.benchmarks import calls, cost, gpu, large, many, maps, operations
+from tests.benchmarks import calls, cost, gpu, large, live, many, maps, operations
 from tests.benchmarks.full_sizes import UNET, VAE
 from tests.benchmarks.matrix import deviation
 from tests.benchmarks.random_marigold import narrowed
@@ -89,6 +89,18 @@ def test_a_row_of_calls_for_every_number_of_threads(capsys):
     assert torch.get_num_threads() == threads
     rows = [line for line in capsys.readouterr().out.splitlines() if "64" in line]
     assert len(rows) == 2 and all("96x64" in row for row in rows)
+
+
+def test_a_row_of_costs_for_every_size_of_a_live_rig(prior, capsys):
+    threads = torch.get_num_threads()
+    live.main(["--widths", "64", "96", "--presets", "fast", "--frames", "2", "--prior", str(prior)])
+    assert torch.get_num_threads() == threads
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    for name in ("64x48, fast", "96x72, fast"):
+        (row,) = (line.removeprefix(name).split() for line in lines if line.startswith(name))
+        check, evidence, call, both, wall, rate = map(float, row)
+        assert min(check, evidence, call) > 0 and both == pytest.approx(evidence + call, abs=1)
+        assert rate == pytest.approx(1000 / wall, rel=0.05)
 
 
 def test_many_pairs_one_after_the_other_and_overlapped(capsys):

@@ -17,9 +17,9 @@ pytestmark = pytest.mark.end_to_end
 TOPICS = ("--left-topic", bags.TOPICS[0], "--right-topic", bags.TOPICS[1])
 
 
-def depth_images(path: Path) -> list[tuple[int, np.ndarray]]:
+def depth_images(path: Path, topic: str = "/depth/image") -> list[tuple[int, np.ndarray]]:
     with AnyReader([path]) as reader:
-        images = [c for c in reader.connections if c.topic == "/depth/image"]
+        images = [c for c in reader.connections if c.topic == topic]
         read = [(at, reader.deserialize(raw, c.msgtype)) for c, at, raw in reader.messages(images)]
     return [(at, image.data.view(np.uint16).reshape(image.height, image.width)) for at, image in read]
 
@@ -44,6 +44,23 @@ def test_a_bag_becomes_a_bag_and_goes_on(geodiff, prior, textured_plane, tmp_pat
     assert Path("depth-frames/000000/depth.npy").stat().st_mtime_ns == kept
     for (_, first), (_, second) in zip(images, depth_images(Path("depth.mcap")), strict=True):
         np.testing.assert_array_equal(first, second)
+
+
+def test_removed_depths_are_unknown_in_every_message_of_a_bag(
+    geodiff, prior, textured_plane, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(bags, "K", textured_plane.K)
+    bags.write_bag(tmp_path / "drive.mcap", images=(textured_plane.left, textured_plane.right))
+    words = ["depth", "drive.mcap", *TOPICS, "--prior", prior, "--steps", "1", "-q", "--out"]
+    assert geodiff(*words, "all.mcap").code == 0
+    most_m = float(np.nanquantile(np.load("all-frames/000000/sigma.npy"), 0.5))
+    answer = geodiff(*words, "holes.mcap", "--max-sigma", most_m, "--holes")
+    assert answer.code == 0, answer.err
+    topics = ("/depth/image", "/depth/sigma")
+    for (_, depth), (_, sigma) in zip(*(depth_images(Path("holes.mcap"), at) for at in topics), strict=True):
+        np.testing.assert_array_equal(depth > 0, sigma > 0)
+        assert 0.1 < (depth > 0).mean() < 0.9 and sigma.max() <= np.ceil(1000 * most_m)
 
 
 FILES = {

@@ -10,6 +10,7 @@ from PIL import Image
 from geodiff_plugin._internal.reprojection import depth_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
 from tests.cli.conftest import QUICK, report_of
+from tests.unit.formats.test_target import extrinsic, intrinsic
 
 pytestmark = pytest.mark.end_to_end
 
@@ -45,6 +46,20 @@ def test_a_pair_is_written_as_the_other_camera_sees_it(pair_files, geodiff, tmp_
     assert answer.code == 0, answer.err
     check(tmp_path / "o")
     assert "depth_reprojected_mm.png" in report_of(tmp_path / "o")["files"]["names"]
+
+
+def test_the_text_of_a_realsense_is_the_camera_of_its_colour_images(pair_files, geodiff, tmp_path):
+    size, text = (80, 56), "Intrinsic Parameters:\n\n"
+    for sizes in (size, (160, 112)):
+        text += intrinsic("Color", np.array(K_TO), sizes, "RGB8")
+    text += extrinsic("Infrared 1", "Color", np.linalg.inv(E_TO))
+    (tmp_path / "realsense.txt").write_text(text)
+    words = [*pair_files.command, *QUICK, "--reproject", tmp_path / "realsense.txt", "--out", "o", "-q"]
+    answer = geodiff(*words)
+    assert answer.code == 2 and "--reproject-size must be a size of the colour images" in answer.err
+    answer = geodiff(*words, "--reproject-size", "80x56")
+    assert answer.code == 0, answer.err
+    check(tmp_path / "o")
 
 
 def test_many_pairs_and_their_smoothed_depth_are_reprojected(pair_files, geodiff, tmp_path):

@@ -87,6 +87,36 @@ def test_a_window_shows_both_and_ends_the_run(geodiff, rig, monkeypatch, texture
     assert shown[0].shape[1] == 2 * width and shown[0][:, width:].std() > 10
 
 
+def test_a_page_shows_every_result_with_its_line_and_ends_with_the_command(geodiff, rig, monkeypatch):
+    from geodiff_plugin.app import live as page
+
+    calls = []
+
+    class Page:
+        address = "http://there"
+
+        def __init__(self, host, port):
+            calls.append((host, port))
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            calls.append("closed")
+
+        def show(self, result, line):
+            calls.append((result.frame.number, line))
+
+    monkeypatch.setattr(page, "LivePage", Page)
+    answer = geodiff(*rig, "--app", "--port", 8000, "--frames", 2)
+    assert answer.code == 0 and "Serving on http://there" in answer.err
+    assert calls[0] == ("127.0.0.1", 8000) and calls[-1] == "closed"
+    assert [number for number, _ in calls[1:-1]] == [0, 1]
+    assert calls[1][1] == answer.out.splitlines()[0] and "frames/s" in calls[2][1]
+    answer = geodiff(*rig, "--port", 8000)
+    assert answer.code == 2 and "--port needs --app" in answer.err
+
+
 def test_an_opencv_without_windows_is_named(geodiff, rig, monkeypatch):
     def none(*_):
         raise cv2.error("The function is not implemented")

@@ -171,6 +171,16 @@ def test_the_ends_of_the_colours_leave_two_per_cent_on_either_side():
             depth_range(depth, near, far)
 
 
+def test_the_colours_of_a_video_keep_nine_tenths_of_their_range():
+    colours = plotting.SmoothedRange()
+    assert colours.update(np.zeros((4, 5))) == (None, None)
+    depth_m = np.linspace(1.0, 3.0, 400).reshape(20, 20)
+    first = colours.update(depth_m)
+    assert first == pytest.approx(depth_range(depth_m))
+    assert colours.update(np.zeros((4, 5))) == first, "a frame without depth changes nothing"
+    assert colours.update(2 * depth_m) == pytest.approx([1.1 * each for each in first])
+
+
 def test_the_ends_of_a_large_map_are_those_of_a_sample_of_its_known_pixels(monkeypatch):
     monkeypatch.setattr(plotting, "MAX_RANGE_PIXELS", 100)
     depth = np.random.default_rng(0).uniform(1, 9, (30, 30))

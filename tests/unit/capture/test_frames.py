@@ -652,7 +652,7 @@ def fused():
 
 @END_TO_END
 def test_the_cloud_lies_on_the_walls_and_its_normals_look_inside(fused):
-    cloud, normals = fuse(*fused)
+    cloud, normals, _ = fuse(*fused)
     assert np.median(np.abs(np.abs(cloud.points_m) - HALF).min(1)) < 0.005
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
     assert ((normals * cloud.points_m).sum(1) < 0).mean() > 0.95

@@ -166,7 +166,7 @@ def test_the_cloud_leaves_out_pixels_that_are_not_valid_even_if_these_are_most()
     frame.depth[:, 10:] = frame.confidence[:, 10:] = 0
     frame = agreed(frame, [])
     assert not kept(frame)[:, 10:].any()
-    cloud, normals = fuse(["a"], lambda name: frame, lambda name: image_of(0))
+    cloud, normals, _ = fuse(["a"], lambda name: frame, lambda name: image_of(0))
     assert len(cloud.points_m) > 50 and np.isfinite(normals).all()
     px, z = frame.camera.project(frame.camera.from_world(cloud.points_m))
     assert (z > 0).all() and px[:, 0].max() < 9.5

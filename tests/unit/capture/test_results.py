@@ -88,9 +88,9 @@ def doubted(number: int) -> DepthFrame:
     frame.depth[rng.random(shape) < 0.02] *= 0.5
     confidence = rng.uniform(0.3, 1, shape).astype(np.float32)
     confirmed, observers = (rng.integers(0, 3, shape).astype(np.uint8) for _ in range(2))
-    return replace(
-        frame, confidence=confidence, confirmed=confirmed, observers=np.maximum(observers, confirmed)
-    )
+    observers = np.maximum(observers, confirmed)
+    sigma = (frame.depth * rng.uniform(0.01, 0.3, shape)).astype(np.float32)
+    return replace(frame, confidence=confidence, confirmed=confirmed, observers=observers, sigma=sigma)
 
 
 def mean_by_cell(rows: list[np.ndarray], cell: float) -> dict[tuple[int, ...], np.ndarray]:
@@ -101,7 +101,7 @@ def mean_by_cell(rows: list[np.ndarray], cell: float) -> dict[tuple[int, ...], n
 
 
 def expected_cloud(frames: list[DepthFrame], every: list[int], factor: float) -> list[np.ndarray]:
-    """Mean position, normal and colour of each cell, over the means of each frame."""
+    """Mean position, normal, colour and sigma of each cell, over the means of each frame."""
     cell = factor * np.median([np.median(frame.depth) for frame in frames])
     means = []
     for frame, step in zip(frames, every, strict=True):
@@ -112,7 +112,7 @@ def expected_cloud(frames: list[DepthFrame], every: list[int], factor: float) ->
         for v, u in np.argwhere(good)[::step]:
             point = frame.camera.E @ [*np.linalg.solve(frame.camera.K, [u, v, 1]) * frame.depth[v, u], 1]
             normal = np.linalg.solve(frame.camera.E[:3, :3].T, normals[v, u])
-            rows.append(np.r_[point[:3], normal, 255 * image[v, u]])
+            rows.append(np.r_[point[:3], normal, 255 * image[v, u], frame.sigma[v, u]])
         means += mean_by_cell(rows, cell).values()
     return list(mean_by_cell(means, cell).values())
 
@@ -130,14 +130,36 @@ def test_a_fused_cloud_has_the_mean_of_every_cell(most, names, monkeypatch):
     counts = [int(kept(frame).sum()) for frame in frames.values()]
     every = [max(1, count // most) for count in counts]
     assert (most > 1000) == (max(every) == 1)
-    cloud, normals = fuse(names, frames.__getitem__, lambda name: image_of(NAMES.index(name)))
+    cloud, normals, sigma = fuse(names, frames.__getitem__, lambda name: image_of(NAMES.index(name)))
     expected = in_order(np.array(expected_cloud(list(frames.values()), every, 0.03)))
-    found = in_order(np.hstack([cloud.points_m, normals, cloud.colours]))
+    found = in_order(np.hstack([cloud.points_m, normals, cloud.colours, sigma[:, None]]))
     assert len(found) == len(expected) and cloud.colours.dtype == np.uint8
     np.testing.assert_allclose(found[:, :3], expected[:, :3], atol=1e-6)
     directions = expected[:, 3:6] / np.linalg.norm(expected[:, 3:6], axis=1, keepdims=True)
     np.testing.assert_allclose(found[:, 3:6], directions, atol=1e-5)
-    assert np.abs(found[:, 6:] - expected[:, 6:]).max() < 0.51
+    assert np.abs(found[:, 6:9] - expected[:, 6:9]).max() < 0.51
+    np.testing.assert_allclose(found[:, 9], expected[:, 9], rtol=1e-6)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 1.0])
+def test_the_sigma_of_a_fused_point_bounds_its_spread_for_every_correlation(correlation, monkeypatch):
+    """One cell with four depths of unlike precision, fused again and again with other errors."""
+    monkeypatch.setattr(results, "CELL_FRACTION", 10.0)
+    monkeypatch.setattr(results, "kept", lambda frame: frame.depth > 0)
+    sigma = np.float32([[0.01, 0.04], [0.02, 0.09]])
+    rng, camera = np.random.default_rng(0), np.diag([50.0, 50.0, 1.0])
+    together, alone = rng.normal(size=(2000, 1, 1)), rng.normal(size=(2000, 2, 2))
+    errors = sigma * (np.sqrt(correlation) * together + np.sqrt(1 - correlation) * alone)
+    fused = []
+    for error in errors:
+        frame = posed_frame("a", (3.0 + error).astype(np.float32), np.ones((2, 2)), camera, np.eye(4))
+        frame = replace(frame, sigma=sigma)
+        fused.append(fuse(["a"], lambda name, frame=frame: frame, lambda name: np.ones((2, 2, 3))))
+    assert {len(each.cloud.points_m) for each in fused} == {1}
+    np.testing.assert_allclose([each.sigma[0] for each in fused], sigma.mean(), rtol=1e-6)
+    spread = np.std([each.cloud.points_m[0, 2] for each in fused])
+    assert spread < 1.05 * sigma.mean() and (spread > 0.95 * sigma.mean()) == (correlation == 1)
+    assert spread > 1.2 * sigma.min(), "the least sigma of a cell is no bound of a mean"
 
 
 def test_a_cloud_of_the_room_lies_on_its_walls_with_their_normals_and_paint(monkeypatch):
@@ -151,7 +173,7 @@ def test_a_cloud_of_the_room_lies_on_its_walls_with_their_normals_and_paint(monk
             n: replace(f, depth=f.depth * np.float32(factor), camera=replace(f.camera, E=f.camera.E * longer))
             for n, f in frames.items()
         }
-        cloud, normals = fuse(NAMES, scaled.__getitem__, lambda name: image_of(NAMES.index(name)))
+        cloud, normals, _ = fuse(NAMES, scaled.__getitem__, lambda name: image_of(NAMES.index(name)))
         points = cloud.points_m / factor
         off = np.abs(np.abs(points) - HALF)
         wall = off.argmin(1)
@@ -180,7 +202,7 @@ def test_points_closer_than_a_cell_are_one_in_every_direction_and_on_either_side
             [260 * nearness, 260 * nearness, 1.0]
         )  # neighbouring pixels are 3.8 or 0.96 mm apart
         frame = posed_frame("a", depth, np.ones_like(depth), camera, np.eye(4))
-        cloud, _ = fuse(["a"], lambda name, frame=frame: frame, lambda name: np.ones((9, 11, 3)))
+        cloud, *_ = fuse(["a"], lambda name, frame=frame: frame, lambda name: np.ones((9, 11, 3)))
         sizes.append(cloud.points_m[:, :2].max(0) // 0.004 + 1)
         assert len(cloud.points_m) == len(np.unique(np.floor(cloud.points_m[:, :2] / 0.004), axis=0))
     assert (sizes[0] >= [10, 8]).all() and (sizes[1] <= [3, 3]).all()
@@ -420,10 +442,8 @@ def test_a_cleared_frame_keeps_the_files_of_others(tmp_path):
             (folder / extra).unlink()
 
 
-def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes_nothing(
-    plain_figures, tmp_path
-):
-    """Depth by a run is kept on first use. The second scene has a frame more than the first."""
+def finished_video(folder):
+    """Five finished frames of the room in two scenes, their images, and their true depth."""
     camera, size = np.array([[150.0, 0, 84.0], [0, 132.0, 68.0], [0, 0, 1]]), (170, 128)
     images, frames, ground_truths = [], [], []
     for i in range(5):
@@ -433,12 +453,20 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
         image, depth = render(E, size, camera)
         images.append(image.astype(np.float32) / 255)
         ground_truths.append(depth)
-        folder = tmp_path / f"f{i}"
-        folder.mkdir()
-        np.save(folder / "depth.npy", (depth * (1 + 0.01 * (-1) ** i)).astype(np.float32))
+        frames.append(FinishedFrame(folder / f"f{i}", camera, "m"))
+        frames[-1].folder.mkdir()
+        np.save(frames[-1].folder / "depth.npy", (depth * (1 + 0.01 * (-1) ** i)).astype(np.float32))
         if i:
-            np.save(folder / "confidence.npy", np.full(depth.shape, 0.1 + 0.2 * i, np.float32))
-        frames.append(FinishedFrame(folder, camera, "m"))
+            confidence = np.full(depth.shape, 0.1 + 0.2 * i, np.float32)
+            np.save(frames[-1].folder / "confidence.npy", confidence)
+    return frames, images, ground_truths
+
+
+def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes_nothing(
+    plain_figures, tmp_path
+):
+    """Depth by a run is kept on first use. The second scene has a frame more than the first."""
+    frames, images, ground_truths = finished_video(tmp_path)
     before = [np.load(frame.folder / "depth.npy") for frame in frames]
     assert results.write_smoothed(frames, images.__getitem__) == [0, 0, 1, 1, 1]
     temporal_smoothing = [np.load(frame.folder / "depth.npy") for frame in frames]
@@ -458,6 +486,41 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
         np.testing.assert_array_equal(np.load(frame.folder / "depth.npy"), depth)
 
 
+def test_depths_that_are_not_reliable_after_smoothing_are_removed(plain_figures, tmp_path):
+    """A wrong depth with a small sigma is replaced by its neighbours', whose sigma is above the limit."""
+    frames, images, _ = finished_video(tmp_path)
+    limits = Thresholds(min_confidence=0.2, max_sigma=0.05)
+    blob = slice(50, 80), slice(60, 100)
+    for frame in frames:
+        depth = np.load(frame.folder / "depth.npy")
+        np.save(frame.folder / "sigma.npy", np.full_like(depth, 0.04))
+        np.save(frame.folder / "confidence.npy", np.full_like(depth, 0.6))
+    depth = np.load(frames[3].folder / "depth.npy")
+    depth[blob] *= 1.5
+    confidence = np.full_like(depth, 0.6)
+    confidence[blob] = 0.4  # the neighbours have more weight
+    np.save(frames[3].folder / "depth.npy", depth)
+    np.save(frames[3].folder / "confidence.npy", confidence)
+
+    def above(frame):
+        depth, sigma = (np.load(frame.folder / f"{name}.npy") for name in ("depth", "sigma"))
+        return (depth > 0) & ~(sigma <= limits.max_sigma)
+
+    results.write_smoothed(frames, images.__getitem__)
+    assert above(frames[3])[blob].mean() > 0.9, "smoothing alone violates the limit"
+    kept = [~above(frame) for frame in frames]
+    results.write_smoothed(frames, images.__getitem__, limits)
+    for frame, mask in zip(frames, kept, strict=True):
+        maps = {name: np.load(frame.folder / f"{name}.npy") for name in ("depth", "confidence", "sigma")}
+        np.testing.assert_array_equal(maps["depth"] > 0, mask)
+        np.testing.assert_array_equal(maps["confidence"] > 0, mask)
+        np.testing.assert_array_equal(np.isnan(maps["sigma"]), ~mask)
+        assert (maps["confidence"][mask] >= limits.min_confidence).all()
+        for name in ("depth_mm", "sigma_mm"):
+            assert not np.asarray(Image.open(frame.folder / f"{name}.png"))[~mask].any()
+        assert (np.load(frame.folder / "depth_alone.npy") > 0).all(), "it is read again"
+
+
 def written(capture: Capture, tmp_path, export=(), not_trusted=()):
     out = tmp_path / "out"
     results.write_agreement(capture, out, NAMES)
@@ -472,18 +535,21 @@ def test_the_cloud_of_a_capture_is_read_by_trimesh_with_its_cameras(
     out, counts = written(finished, tmp_path, (), not_trusted)
     frames = {}
     for number, name in enumerate(NAMES):
-        depth, confidence, confirmed, observers = (
-            np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "observers")
+        depth, confidence, confirmed, observers, sigma = (
+            np.load(out / name / f"{m}.npy")
+            for m in ("depth", "confidence", "confirmed", "observers", "sigma")
         )
         observers = np.ones_like(observers) if not_trusted == [name] else observers
-        frames[name] = posed_frame(name, depth, confidence, KS[number], ES[number], confirmed, observers)
-    cloud, normals = fuse(NAMES, frames.__getitem__, finished.image)
+        frame = posed_frame(name, depth, confidence, KS[number], ES[number], confirmed, observers)
+        frames[name] = replace(frame, sigma=sigma)
+    cloud, normals, sigma = fuse(NAMES, frames.__getitem__, finished.image)
     read = trimesh.load(out / "cloud.ply", process=False)
     assert counts == {"cloud_points": len(cloud.points_m)}
     np.testing.assert_allclose(read.vertices, cloud.points_m, atol=1e-6)
     np.testing.assert_array_equal(read.colors[:, :3], cloud.colours)
     data = read.metadata["_ply_raw"]["vertex"]["data"]
     np.testing.assert_allclose(np.stack([data[n] for n in ("nx", "ny", "nz")], -1), normals, atol=1e-6)
+    assert np.isfinite(sigma).all() and np.array_equal(data["sigma"], sigma.astype(np.float32))
     assert b"comment world frame, metres" in (out / "cloud.ply").read_bytes()[:200]
     scene = trimesh.load(out / "cloud.glb")
     shown = [g for g in scene.dump() if isinstance(g, trimesh.PointCloud)]

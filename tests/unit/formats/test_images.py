@@ -5,7 +5,6 @@ import math
 import struct
 import sys
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -29,6 +28,7 @@ from geodiff_plugin.formats.images import (
 )
 from tests.fuzz.test_fuzz import EXAMPLES, damaged, is_recoverable
 from tests.unit.error_sentences import check_error
+from tests.unit.formats.heic_files import with_group
 
 RNG = np.random.default_rng(12)
 PIXELS = RNG.integers(0, 256, (36, 52, 3), np.uint8)
@@ -552,42 +552,12 @@ def test_all_kinds_of_images_in_memory_agree(value, atol):
     assert not isinstance(value, torch.Tensor) or value.any(), "memory is not shared"
 
 
-def boxes(data: bytes, start: int, stop: int) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of the boxes of a file."""
-    while start < stop:
-        size, kind = struct.unpack_from(">I4s", data, start)
-        yield kind, start, start + size
-        start += size
-
-
-def with_group(whole: bytes, kind: bytes, order: tuple[int, ...]) -> bytes:
-    """A HEIC file with a box ``grpl`` of one group of its images, counted from 0, after the standard."""
-    data = bytearray(whole)
-    start, stop = next((a, b) for name, a, b in boxes(data, 0, len(data)) if name == b"meta")
-    at = next(a for name, a, _ in boxes(data, start + 12, stop) if name == b"iloc")
-    assert data[at + 8] == 0 and data[at + 12 : at + 14] == b"\x44\x40"  # version 0, all of four bytes
-    (count,) = struct.unpack_from(">H", data, at + 14)
-    items, places, at = [], [], at + 16
-    for _ in range(count):
-        number, extents = struct.unpack_from(">H6xH", data, at)
-        items.append(number)
-        places += [at + 10 + 8 * extent for extent in range(extents)]
-        at += 10 + 8 * extents
-    members = b"".join(struct.pack(">I", items[rgb]) for rgb in order)
-    group = struct.pack(">I4sIII", 20 + len(members), kind, 0, 77, len(order)) + members
-    group = struct.pack(">I4s", 8 + len(group), b"grpl") + group
-    for place in places:  # images lie behind it
-        struct.pack_into(">I", data, place, struct.unpack_from(">I", data, place)[0] + len(group))
-    struct.pack_into(">I", data, start, stop - start + len(group))
-    return bytes(data[:stop] + group + data[stop:])
-
-
 def spatial(path: Path, kind: bytes = b"ster", order: tuple[int, ...] = (1, 0)) -> Path:
     """A HEIC file with the mirrored image first, as the main one, and then the other one."""
     pillow_heif = pytest.importorskip("pillow_heif", minversion="1.8")
     pillow_heif.register_heif_opener()
     Image.fromarray(RAMP[:, ::-1]).save(path, save_all=True, append_images=[PIL], quality=-1)
-    path.write_bytes(with_group(path.read_bytes(), kind, order))
+    path.write_bytes(with_group(path.read_bytes(), order, kind))
     return path
 
 

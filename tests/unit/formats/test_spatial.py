@@ -9,40 +9,12 @@ import pytest
 
 from geodiff_plugin import InputError
 from geodiff_plugin.formats import read_calibration
+from tests.unit.formats.heic_files import CMEX, CMIN, as_uuid, box, cmex, cmin, full
 
-CMIN = bytes.fromhex("22cc04c7d6d94e079d904eb6ecbaf3a3")
-CMEX = bytes.fromhex("4363e9145b7d4aab97aebea69803b434")
-#: Focal length and principal point relative to the image; denominators of 2 ** 30.
-FOCAL, CENTRE, SHIFT = 0.59588, 0.5, 30
+#: Focal length and principal point relative to the image.
+FOCAL, CENTRE = 0.59588, (0.5, 0.48)
 LEFT, RIGHT = 26, 52
-
-
-def box(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I4s", 8 + len(data), kind) + data
-
-
-def full(kind: bytes, flags: int, data: bytes) -> bytes:
-    return box(kind, struct.pack(">I", flags) + data)
-
-
-def as_uuid(plain: bytes, name: bytes) -> bytes:
-    return box(b"uuid", name + plain[8:])
-
-
-def fixed(*values: float) -> bytes:
-    return b"".join(struct.pack(">i", round(value * 2**SHIFT)) for value in values)
-
-
-def cmin(anisotropic: bool = False) -> bytes:
-    """Focal length and principal point; with a focal length along y and a skew if they differ."""
-    more = fixed(0.6) + struct.pack(">i", 0) if anisotropic else b""
-    return full(b"cmin", SHIFT << 8 | anisotropic, fixed(FOCAL, CENTRE, 0.48) + more)
-
-
-def cmex(x_um: int = 0, further: int = 0) -> bytes:
-    """The position along x in micrometres; 0 is left out."""
-    values = struct.pack(">i", x_um) * bool(x_um) + struct.pack(">i", 9) * bool(further)
-    return full(b"cmex", bool(x_um) | further, values)
+LENS = cmin(FOCAL, *CENTRE)
 
 
 SIZE = full(b"ispe", 0, struct.pack(">II", 2560, 1920))
@@ -75,7 +47,7 @@ def photo(
 
 
 def pair(x_um: int = 63807, uuids: bool = True) -> tuple[list[bytes], list[bytes]]:
-    cameras = [(cmin(), cmex()), (cmin(), cmex(x_um))]
+    cameras = [(LENS, cmex()), (LENS, cmex(x_um))]
     if uuids:
         cameras = [(as_uuid(each[0], CMIN), as_uuid(each[1], CMEX)) for each in cameras]
     return [SIZE, *cameras[0]], [SIZE, *cameras[1]]
@@ -96,7 +68,7 @@ def test_cameras_are_read_from_both_images(tmp_path, uuids, wide):
 
 def test_focal_lengths_along_x_and_y_may_differ(tmp_path):
     left, right = pair()
-    left[1] = right[1] = cmin(anisotropic=True)
+    left[1] = right[1] = cmin(FOCAL, *CENTRE, fy=0.6)
     rig = read_calibration(photo(tmp_path / "pair.heif", left, right))
     assert rig.K_left[0, 0] == pytest.approx(FOCAL * 2560) and rig.K_left[1, 1] == pytest.approx(0.6 * 1920)
 
@@ -104,15 +76,21 @@ def test_focal_lengths_along_x_and_y_may_differ(tmp_path):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"right": [SIZE, cmin(), cmex(63807, 2)]}, "cameras that are rotated, or not next to each other"),
-        ({"right": [SIZE, cmin(), cmex(63807, 8)]}, "cameras that are rotated, or not next to each other"),
-        ({"right": [SIZE, cmin()]}, "no box cmex"),
+        (
+            {"right": [SIZE, LENS, cmex(63807, 2)]},
+            "cameras that are rotated, or not next to each other",
+        ),
+        (
+            {"right": [SIZE, LENS, cmex(63807, 8)]},
+            "cameras that are rotated, or not next to each other",
+        ),
+        ({"right": [SIZE, LENS]}, "no box cmex"),
         ({"left": [SIZE]}, "no box cmin"),
-        ({"right": [SIZE, cmin(), cmex(5), box(b"irot", b"\x01")]}, "a rotation of its images"),
-        ({"right": [SIZE, cmin(), cmex(5), box(b"clap", bytes(32))]}, "a crop of its images"),
+        ({"right": [SIZE, LENS, cmex(5), box(b"irot", b"\x01")]}, "a rotation of its images"),
+        ({"right": [SIZE, LENS, cmex(5), box(b"clap", bytes(32))]}, "a crop of its images"),
         ({"group": b"altr"}, "no stereo pair"),
-        ({"right": [SIZE, cmin(), cmex()]}, "must be different; got the same"),
-        ({"right": [SIZE, cmin(), cmex(-63807)]}, "the baseline must be positive"),
+        ({"right": [SIZE, LENS, cmex()]}, "must be different; got the same"),
+        ({"right": [SIZE, LENS, cmex(-63807)]}, "the baseline must be positive"),
     ],
 )
 def test_files_without_cameras_that_can_be_used_say_why(tmp_path, more, message):

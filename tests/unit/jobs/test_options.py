@@ -135,6 +135,7 @@ UNSUPPORTED = [
     ({**PAIR, **CAMERA, **RAY, "temporal_smoothing": True}, "--temporal-smoothing needs --format folders"),
     ({**PAIR, **CAMERA, **RAY, "export": ("glb",)}, "--export needs --format folders"),
     ({**PAIR, **CAMERA, **RAY, "format": "parquet", "reproject": LEFT}, "--reproject needs --format folders"),
+    ({**PAIR, **CAMERA, "reproject_size": "64x48"}, "--reproject-size needs --reproject"),
     ({**PAIR, "estimate_pose": True, "calib": (LEFT,)}, "--calib cannot be used with --estimate-pose"),
     ({**PAIR, "estimate_pose": True, "e": LEFT}, "--E cannot be used with --estimate-pose"),
     ({**PAIR, "estimate_pose": True, "cx_right": 3.0}, "--cx-right cannot be used with --estimate-pose"),
@@ -362,6 +363,7 @@ def test_every_named_file_is_looked_at_before_the_work(files):
         ({"calib": (files / "none.txt",)}, "calibration must be"),
         ({"view_e": (files / "none.txt",)}, "--view-E must be"),
         ({"reproject": files / "calib.txt"}, "--reproject must be"),
+        ({"reproject": left, "reproject_size": "64"}, "--reproject-size must be WIDTHxHEIGHT"),
     ):
         with pytest.raises(InputError, match=said):
             check_files(replace(further, **changes))

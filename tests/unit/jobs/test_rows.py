@@ -57,6 +57,18 @@ def test_the_columns_of_a_result_are_its_maps_camera_and_numbers():
     assert row["confidence"] is None and row["unit"] is None
 
 
+def test_removed_depths_are_0_in_all_maps_of_a_row():
+    run = made_runs.run()
+    depth_m, sigma_m = one_map(run.output.prediction), one_map(run.output.sigma)
+    most = float(np.nanquantile(sigma_m, 0.4))
+    row = result_columns(replace(run, output=run.output.with_holes(0.5, most)))
+    kept = (one_map(run.output.confidence) >= 0.5) & (sigma_m <= most)
+    assert 0.05 < kept.mean() < 0.6
+    for name in ("depth_mm", "confidence", "sigma_mm"):
+        np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(row[name]))) > 0, kept)
+    assert row["far_m"] == pytest.approx(float(depth_m[kept].max()))
+
+
 @pytest.fixture
 def read(monkeypatch):
     """The options with which a pair is read, and its files at that time."""

@@ -1,6 +1,7 @@
 """Depth of a video that is averaged over frames: what is written and reported of each frame."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,8 @@ def run(tmp_path, monkeypatch):
         np.save(tmp_path / name / "depth.npy", made_runs.depth_map() + n)
     asked = {"read": [], "scenes": [0] * 12}
 
-    def write(frames, image):
-        asked["frames"] = frames
+    def write(frames, image, holes):
+        asked["frames"], asked["holes"] = frames, holes
         for n, frame in enumerate(frames):
             asked["read"].append(image(n))
             confidence = np.full((36, 50), 0.7, np.float32)
@@ -73,6 +74,15 @@ def test_every_frame_is_averaged_with_its_own_camera_and_lists_its_files(run, tm
         } <= set(names)
 
 
+def test_the_thresholds_of_holes_apply_to_the_smoothed_depth(run):
+    limits = {"min_confidence": 0.4, "max_sigma": 0.05}
+    for holes, expected in ((False, None), (True, (0.4, 0.05))):
+        write_smoothed_frames(
+            replace(run["options"], **limits, holes=holes), run["refs"][:2], lambda ref: None
+        )
+        assert run["holes"] == expected
+
+
 def test_another_camera_sees_the_averaged_depth_where_there_is_one(run, tmp_path):
     write_smoothed_frames(run["options"], run["refs"][:2], lambda ref: None)
     for n in range(2):
@@ -81,7 +91,7 @@ def test_another_camera_sees_the_averaged_depth_where_there_is_one(run, tmp_path
         known = made_runs.depth_map() + n + 0.1
         known[5:7] = 0.0
         K = made_runs.K_LEFT + n * np.diag([1.0, 1.0, 0])
-        reported = write_reprojected(tmp_path, known, K, run["options"].reproject)
+        reported = write_reprojected(tmp_path, known, K, run["options"].target_camera())
         np.testing.assert_array_equal(seen_m, np.load(tmp_path / "depth_reprojected.npy"))
         assert json.loads((folder / "report.json").read_text())["reproject"] == reported
         millimetres = np.asarray(Image.open(folder / "depth_reprojected_mm.png"))

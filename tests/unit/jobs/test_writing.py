@@ -10,6 +10,7 @@ from PIL import Image
 
 from geodiff_plugin import plotting
 from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.formats.target import read_target_camera
 from geodiff_plugin.jobs import writing
 from geodiff_plugin.jobs.records import PairOrigin
 from geodiff_plugin.jobs.report import build_report
@@ -278,7 +279,9 @@ def test_depth_in_another_camera_is_that_of_the_same_points(tmp_path):
     normal, offset = np.array([0.1, -0.05, 1.0]), 2.5  # n . x = d
     v, u = np.mgrid[:60, :80]
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
-    reported = write_reprojected(tmp_path, (offset / (rays @ normal)).astype(np.float32), K, path)
+    reported = write_reprojected(
+        tmp_path, (offset / (rays @ normal)).astype(np.float32), K, read_target_camera(path)
+    )
     E, K_into = np.array(camera["E"]), np.array(camera["K"], float)
     v, u = np.mgrid[:24, :28]
     rays = np.stack([u, v, np.ones(u.shape)], -1) @ np.linalg.inv(K_into).T @ E[:3, :3].T
@@ -310,7 +313,7 @@ def test_a_pair_is_written_with_all_that_its_options_ask_for(run, tmp_path):
     assert not (tmp_path / "out/undistorted.png").exists()
     valid = one_map(run.output.valid)
     expected = write_reprojected(
-        tmp_path, one_map(run.output.prediction) * valid, made_runs.K_LEFT, options.reproject
+        tmp_path, one_map(run.output.prediction) * valid, made_runs.K_LEFT, options.target_camera()
     )
     assert report["reproject"] == expected
     into = [np.load(folder / "depth_reprojected.npy") for folder in (tmp_path, tmp_path / "out")]
