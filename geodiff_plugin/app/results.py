@@ -24,6 +24,7 @@ from geodiff_plugin.app.shown import Shown, visible_in_viewer
 from geodiff_plugin.cameras import PosedCamera
 from geodiff_plugin.formats import MAX_16_BITS, REPORT
 from geodiff_plugin.formats.clouds import CAMERA_COLOURS, EDGES, PYRAMID_FRACTION, camera_pyramid
+from geodiff_plugin.jobs import limit_words
 from geodiff_plugin.plotting import colour_depth, colour_fraction, depth_range, ticks
 from geodiff_plugin.result.readings import Reading, metres
 
@@ -113,6 +114,12 @@ def check_pixel(shown: Shown, pixel: tuple[int, int]) -> None:
     if not (0 <= x < width and 0 <= y < height):
         raise PageError(
             f"({x}, {y}) is outside of the image: x goes from 0 to {width - 1}, y from 0 to {height - 1}."
+        )
+    if shown.beyond is not None and shown.measurable_m is not None and shown.beyond[y, x]:
+        limit = limit_words(shown.measurable_m, "m")
+        raise PageError(
+            f"({x}, {y}) is too far to be measured: these cameras measure depths up to {limit}. "
+            "Choose a nearer point."
         )
     if not (np.isfinite(shown.depth_m[y, x]) and shown.depth_m[y, x] > 0):
         raise PageError(f"({x}, {y}) has no depth. Choose a point on a nearby surface.")

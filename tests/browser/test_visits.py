@@ -209,6 +209,23 @@ def test_swapped_images_are_rejected_with_the_swap_as_first_reason(visitor, tmp_
     )
 
 
+def test_sky_is_not_measured_and_the_legend_ends_at_the_measurable_range(visitor):
+    page = visitor()
+    click_example(page, LABELS.index("Street"))
+    page.wait_for_selector("#status .verdict:not(.example) .figures", timeout=RUN_MS)
+    idle(page)
+    limit = float(re.search(r"beyond (\d+) m", page.locator("#status .figures").inner_text()).group(1))
+    tab(page, "Measure")
+    field(page, "pixel").fill("240, 4")
+    page.keyboard.press("Enter")
+    message = page.wait_for_selector("#readings .error").inner_text()
+    assert "(240, 4) is too far to be measured" in message and f"up to {limit:g} m" in message
+    assert marks(page) == []
+    tab(page, "Depth")
+    labels = page.locator("#depth-legend .legend-ticks span").all_inner_texts()
+    assert labels and max(float(label.removesuffix(" m")) for label in labels) <= limit
+
+
 def test_an_empty_3d_view_states_why_it_is_empty(visitor):
     page = visitor()
     page.wait_for_selector(".viewer-count >> text=% of the pixels")

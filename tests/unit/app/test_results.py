@@ -84,6 +84,21 @@ def test_a_pixel_without_depth_is_explained(depth):
         results.check_pixel(shown, (7, 9))
 
 
+def test_a_pixel_beyond_the_measurable_range_is_explained_by_that_range():
+    shown = made_result()
+    beyond = shown.depth_m > 2.5
+    shown = replace(shown, depth_m=np.where(beyond, 0, shown.depth_m), beyond=beyond, measurable_m=71.37)
+    y, x = np.argwhere(beyond)[3]
+    with pytest.raises(PageError, match=rf"\({x}, {y}\) is too far to be measured: .* up to 71 m\. Choose"):
+        results.check_pixel(shown, (x, y))
+    results.check_pixel(shown, (0, 0))
+    image, plain = results.map_image(shown, "depth"), colour_depth(shown.depth_m)
+    hatched = (image != plain).any(-1)
+    assert hatched.any() and not (hatched & ~beyond).any()
+    ends = [float(text) for text in re.findall(r">([\d.]+) m<", results.legend_of_depth(shown.depth_m))]
+    assert max(ends) <= 2.5 < made_result().depth_m.max()
+
+
 def test_names_of_points_go_on_after_z():
     names = [results.point_name(number) for number in range(26 + 26 * 26 + 1)]
     assert names[:3] == ["A", "B", "C"] and names[25:29] == ["Z", "AA", "AB", "AC"]
