@@ -115,7 +115,8 @@ def _failed(error: Exception, request: Request | None = None) -> str:
     if isinstance(error, InputError):
         options = None if request is None else request.options
         paths = () if options is None else (*options.image_files().values(), *options.calib)
-        message = error_on_page(error, {path.parent for path in paths})
+        camera_input = "" if request is None else request.camera_input
+        message = error_on_page(error, {path.parent for path in paths}, camera_input)
         link = templates.LINK_TO_FORMATS if isinstance(error, UnknownFormatError) else ""
         return templates.failed(message, link)
     traceback.print_exception(error, file=sys.stderr)

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin.app import templates
-from geodiff_plugin.app.messages import PageError
+from geodiff_plugin.app.messages import PageError, check_inside
 from geodiff_plugin.app.sessions import Result
 from geodiff_plugin.app.shown import Shown, visible_in_viewer
 from geodiff_plugin.cameras import PosedCamera
@@ -111,10 +111,7 @@ def data_url(pixels: np.ndarray) -> str:
 def check_pixel(shown: Shown, pixel: tuple[int, int]) -> None:
     """Raise ``PageError`` for a pixel outside the image, or without depth."""
     (x, y), (height, width) = pixel, shown.depth_m.shape
-    if not (0 <= x < width and 0 <= y < height):
-        raise PageError(
-            f"({x}, {y}) is outside of the image: x goes from 0 to {width - 1}, y from 0 to {height - 1}."
-        )
+    check_inside(pixel, (width, height), f"({x}, {y})")
     if shown.beyond is not None and shown.measurable_m is not None and shown.beyond[y, x]:
         limit = limit_words(shown.measurable_m, "m")
         raise PageError(
