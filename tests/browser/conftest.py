@@ -43,8 +43,8 @@ def address(chromium, tmp_path_factory):
 
 @pytest.fixture
 def visitor(chromium, address):
-    """``visitor()`` opens the page as another visitor; what it asks of other hosts is a failure."""
-    contexts, foreign = [], []
+    """``visitor()`` opens the page as another visitor; foreign requests and exceptions are failures."""
+    contexts, foreign, errors = [], [], []
 
     def note(request) -> None:
         if not request.url.startswith((address, "data:", "blob:")):
@@ -60,6 +60,7 @@ def visitor(chromium, address):
         context.set_default_timeout(60_000)  # of a machine that does other things as well
         page = context.new_page()
         page.on("request", note)
+        page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(address)
         page.wait_for_selector("#run")
         return page
@@ -67,7 +68,7 @@ def visitor(chromium, address):
     yield come
     for context in contexts:
         context.close()
-    assert foreign == []
+    assert foreign == [] and errors == []
 
 
 @pytest.fixture(scope="session")

@@ -224,6 +224,13 @@ def test_sky_is_not_measured_and_the_legend_ends_at_the_measurable_range(visitor
     tab(page, "Depth")
     labels = page.locator("#depth-legend .legend-ticks span").all_inner_texts()
     assert labels and max(float(label.removesuffix(" m")) for label in labels) <= limit
+    page.wait_for_selector("#depth-headline >> text=is too far to be measured")
+    image = page.locator(".compare .images").bounding_box()
+    page.mouse.click(image["x"] + 0.5 * image["width"], image["y"] + 0.9 * image["height"])
+    page.wait_for_selector("#depth-headline .distance")
+    page.mouse.click(image["x"] + 0.54 * image["width"], image["y"] + 0.012 * image["height"])
+    page.wait_for_selector("#depth-headline >> text=is too far to be measured")
+    assert len(marks(page)) == 1
 
 
 def test_an_empty_3d_view_states_why_it_is_empty(visitor):
@@ -238,6 +245,30 @@ def test_an_empty_3d_view_states_why_it_is_empty(visitor):
     page.locator(".viewer canvas").click()  # and a click in it does nothing
     slider.fill("50")
     page.wait_for_selector(".viewer-empty", state="hidden")
+
+
+def test_clicks_in_a_3d_view_whose_result_is_gone_do_nothing(visitor):
+    """The data are emptied, as after a failed run without an earlier result."""
+    page = visitor()
+    page.wait_for_selector(".viewer-count >> text=% of the pixels")
+    page.evaluate("document.querySelector('#scene-data .page-data').textContent = ''")
+    page.wait_for_selector(".viewer-empty >> text=There is no result to show.")
+    canvas = page.locator(".viewer canvas")
+    box = canvas.bounding_box()
+    for x, y in ((0.5, 0.5), (0.3, 0.6)):
+        page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.6 * box["height"], steps=4)
+    page.mouse.up()
+    for key in ("ArrowLeft", "Shift+ArrowLeft", "+", "-"):
+        canvas.press(key)
+    page.locator(".viewer [name=confidence]").fill("80")
+    page.locator(".viewer [name=points]").check()
+    page.locator(".viewer [name=reset]").click()
+    tab(page, "Measure")
+    page.wait_for_timeout(500)
+    assert len(marks(page)) == 2
 
 
 def test_a_phone_begins_with_the_images_alone_and_asks_for_what_they_lack(visitor, pair_without_exif):
