@@ -32,13 +32,19 @@ def chromium():
 
 
 @pytest.fixture(scope="session")
-def address(chromium, tmp_path_factory):
-    """Address of ``geodiff app`` in a process of its own."""
+def server(chromium, tmp_path_factory):
+    """Address of ``geodiff app`` in a process of its own, and the file with its output."""
     pytest.importorskip("gradio", reason="gradio is not installed")
     folder, port = tmp_path_factory.mktemp("app"), free_port()
     command = [sys.executable, "-m", "geodiff_plugin", "app", "--device", "cpu", "--port", str(port)]
     with served(command, port, folder) as url:
-        yield url
+        yield url, folder / "log.txt"
+
+
+@pytest.fixture(scope="session")
+def address(server):
+    """Address of ``geodiff app`` in a process of its own."""
+    return server[0]
 
 
 @pytest.fixture

@@ -29,6 +29,7 @@ from geodiff_plugin.app.sessions import Result, Stopped
 from geodiff_plugin.app.shown import clean_report, load, save, shown_of, visible_in_viewer
 from geodiff_plugin.formats import read_calibration, read_image
 from geodiff_plugin.jobs import DepthOptions
+from tests.images.rooms import room_named
 from tests.unit.app.made_result import made_result
 
 gr = pytest.importorskip("gradio", reason="gradio is in the extra app")
@@ -180,6 +181,10 @@ def test_the_page_opens_with_a_finished_result(page, desk):
     assert 0.1 < segment.length_m < 1 and 0 < segment.spread_m < segment.length_m / 3
     assert segment.text in found.headline() and "use your own pair" in found.headline()
     assert visible_in_viewer(first.shown).mean() > 0.5
+
+
+def test_the_first_measurement_is_the_one_of_the_animation_in_the_readme(page):
+    assert page.module.read_first_result().pixels == list(room_named("toy").clicks)
 
 
 def test_components_have_the_ids_that_styles_and_scripts_use(page, desk):
