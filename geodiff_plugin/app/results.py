@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
-from zipfile import ZIP_STORED, ZipFile
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 from PIL import Image
@@ -39,6 +39,8 @@ LEGEND_STOPS = 24
 ARCHIVE = "result.zip"
 #: Suffix of arrays, which are not in the archive: they hardly compress, and most visitors need none.
 ARRAYS = ".npy"
+#: Suffixes of files that are compressed in the archive, fast; images are compressed already.
+COMPRESSED = (".glb", ".ply")
 #: Name of the table with the visitor's measurements.
 MEASUREMENTS = "measurements.csv"
 #: File for download -> purpose; in the order of the page.
@@ -294,8 +296,9 @@ def files_of(result: Result) -> list[Path]:
     *wanted, last = PURPOSES
     paths = [folder / name for name in (*wanted, *sorted(own.difference(PURPOSES)), last) if name in own]
     if archive_is_old or not (folder / ARCHIVE).exists():
-        with ZipFile(folder / ARCHIVE, "w", ZIP_STORED) as archive:
+        with ZipFile(folder / ARCHIVE, "w", compresslevel=1) as archive:
             for path in paths:
                 if path.suffix != ARRAYS:
-                    archive.write(path, path.name)
+                    kind = ZIP_DEFLATED if path.suffix in COMPRESSED else ZIP_STORED
+                    archive.write(path, path.name, kind)
     return [folder / ARCHIVE, *paths]
