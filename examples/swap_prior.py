@@ -24,6 +24,9 @@ from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
 from geodiff_plugin.priors import find_prior
 
+#: Maximum number of images per row.
+COLUMNS = 4
+
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
@@ -62,7 +65,11 @@ def main(argv: list[str] | None = None) -> None:
 
     near, far = depth_range(np.concatenate(maps))  # one colour scale, so that maps are comparable
     images = [left, *(colour_depth(depth_m, near=near, far=far) for depth_m in maps)]
-    grid(images, [f"left image; colours: {near:.2f} m to {far:.2f} m", *titles]).save(options.out)
+    rows = -(-len(images) // COLUMNS)
+    sheet = grid(
+        images, ["left image", *titles], columns=min(COLUMNS, len(images)), depth_ranges=[(near, far)] * rows
+    )
+    sheet.save(options.out)
     print(f"{options.out}")
 
 

@@ -292,7 +292,7 @@ def grid(
     columns: int | None = None,
     cell_width: int = 320,
     image_width: int | None = None,
-    depth_ranges: Sequence[tuple[float, float]] = (),
+    depth_ranges: Sequence[tuple[float, float] | None] = (),
 ) -> Image.Image:
     """Draw a contact sheet: images in a grid, each under its title, scaled to ``cell_width`` pixels.
 
@@ -304,7 +304,8 @@ def grid(
         columns: number of images per row.
         cell_width: width of the scaled images, pixels.
         image_width: part of this width above which titles are centred, if cells include colour bars.
-        depth_ranges: nearest and farthest depth of the colours of each row, metres, for a bar at its end.
+        depth_ranges: nearest and farthest depth of the colours of each row, metres, for a bar at its end;
+            ``None`` for a row without one.
     """
     rgb_images = [as_rgb_image(image) for image in images]
     if not rgb_images or len(titles) != len(rgb_images):
@@ -314,10 +315,14 @@ def grid(
     cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in rgb_images]
     rows = [cells[start : start + columns] for start in range(0, len(cells), columns)]
     heights = [head + GAP + max(cell.height for cell in row) for row in rows]
-    legends = [_depth_bar(h - head - GAP, *ends) for h, ends in zip(heights, depth_ranges, strict=False)]
+    legends = {
+        number: _depth_bar(heights[number] - head - GAP, *ends)
+        for number, ends in enumerate(depth_ranges[: len(rows)])
+        if ends is not None
+    }
     wide = GAP + columns * (cell_width + GAP)
     top = GAP
-    size = wide + max((legend.width for legend in legends), default=0), GAP + sum(heights)
+    size = wide + max((legend.width for legend in legends.values()), default=0), GAP + sum(heights)
     sheet = Image.new("RGB", size, "white")
     named = iter(titles)
     for number, (row, height) in enumerate(zip(rows, heights, strict=True)):
@@ -325,7 +330,7 @@ def grid(
         for k, cell in enumerate(row):
             sheet.paste(cell, (GAP + k * (cell_width + GAP), top + head))
         sheet.paste(_heading(names, wide, head, cell_width, image_width or cell_width), (0, top))
-        if number < len(legends):
+        if number in legends:
             sheet.paste(legends[number], (wide, top + head))
         top += height
     return sheet

@@ -165,7 +165,7 @@ def check_baseline(E: np.ndarray, name: str, unit: str | None) -> None:
     if baseline < 1e-6:
         expected = "a pose with a baseline (a camera centre that differs from the left camera's)"
         hint = "Two views without a baseline have no parallax; pass the baseline in metres."
-        bad_value(name, expected, f"a translation of {baseline:.1g} m", hint)
+        bad_value(name, expected, f"a translation of {baseline:.1g} m", hint, code="calibration.no-baseline")
     if unit == "m" and baseline > LONG_BASELINE_M:
         hint = "divide its translation, or baseline_m (--baseline, --metres-per-unit), by 1000."
         message = f"{name} has an implausible baseline of {baseline:.4g} m. If it is in millimetres, {hint}"

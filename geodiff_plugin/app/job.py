@@ -9,7 +9,7 @@ import re
 import secrets
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,11 @@ from PIL import Image
 
 from geodiff_plugin._internal.checks import InputError, check_choice
 from geodiff_plugin.app.lenses import LENSES
-from geodiff_plugin.app.messages import PageError
+from geodiff_plugin.app.messages import PageError, check_inside
 from geodiff_plugin.app.sessions import Stopped
 from geodiff_plugin.app.shown import Pixels
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, REAL_PAIRS_FOLDER, example_name
-from geodiff_plugin.cameras import field_of_view_deg
+from geodiff_plugin.cameras import Size, field_of_view_deg
 from geodiff_plugin.findings import Finding
 from geodiff_plugin.formats import OutFolder, intrinsics_from_exif, upright_size
 from geodiff_plugin.jobs import (
@@ -66,6 +66,8 @@ GUESSES = {
     "One step to the side, about 70 cm": (0.7, 0.25),
     "Two steps to the side, about 1.4 m": (1.4, 0.25),
 }
+#: Name of the field in messages.
+BASELINE_NAME = "The distance between the cameras"
 #: Matches one coordinate of the end points of the known length.
 ENDS = re.compile(r"-?\d+(?:\.\d+)?")
 #: Larger images are not decoded. At this size the page's process peaks at 4.2 GB; each further megapixel
@@ -193,6 +195,7 @@ class Request:
         assumptions: what the page assumed.
         scale_rel_std: relative standard deviation of the scale; ``None`` if unknown.
         pixels: ends of the known length, which are measured in the result.
+        camera_input: source of the cameras, a key of ``CAMERA_INPUTS``.
     """
 
     options: DepthOptions
@@ -200,6 +203,7 @@ class Request:
     assumptions: tuple[Finding, ...] = ()
     scale_rel_std: float | None = None
     pixels: Pixels = field(default_factory=list)
+    camera_input: str = ""
 
 
 def pair_name(left: Path, right: Path) -> str:
@@ -225,9 +229,9 @@ def request_of(left: str | None, right: str | None, cameras: CameraFields, **run
         paths.append(Path(path))
     _check_settings(run)
     make = {"file": _of_file, "numbers": _of_numbers, "images": _of_images}[cameras.camera_input]
-    request = make(cameras, sizes[0])
+    request = make(cameras, sizes)
     options = replace(request.options, left=paths[0], right=paths[1], export=("glb", "mesh"), **run)
-    return replace(request, options=options, name=pair_name(*paths))
+    return replace(request, options=options, name=pair_name(*paths), camera_input=cameras.camera_input)
 
 
 def _check_settings(run: dict[str, Any]) -> None:
@@ -246,20 +250,22 @@ def _request(**options: Any) -> Request:
     return Request(DepthOptions(left=Path(), **options), "")
 
 
-def _of_file(given: CameraFields, size: tuple[int, int]) -> Request:
+def _of_file(given: CameraFields, sizes: Sequence[Size]) -> Request:
     if not given.calib:
         raise PageError(
             "The calibration file is missing. Choose one, or estimate the camera positions from the images."
         )
+    _check_positive(given.baseline, BASELINE_NAME)
     return _request(baseline=given.baseline, calib=tuple(map(Path, given.calib)))
 
 
-def _of_numbers(given: CameraFields, size: tuple[int, int]) -> Request:
+def _of_numbers(given: CameraFields, sizes: Sequence[Size]) -> Request:
     needed = {"fx in pixels": given.lens.get("fx"), "the distance between the cameras": given.baseline}
     if missing := [name for name, value in needed.items() if value is None]:
         raise PageError(f"Enter {' and '.join(missing)} as well.")
-    _check_positive(given.baseline, "The distance between the cameras")
-    return _request(baseline=given.baseline, cx_right=given.cx_right, **_lens(given))
+    _check_positive(given.baseline, BASELINE_NAME)
+    _check_within(given.cx_right, "The right camera's cx", sizes[1][0])
+    return _request(baseline=given.baseline, cx_right=given.cx_right, **_lens(given, sizes[0]))
 
 
 def _check_positive(value: float | None, name: str) -> None:
@@ -267,28 +273,40 @@ def _check_positive(value: float | None, name: str) -> None:
         raise PageError(f"{name} must be above 0.")
 
 
-def _lens(given: CameraFields) -> dict[str, float]:
-    return {name: value for name, value in given.lens.items() if value is not None}
+def _check_within(value: float | None, name: str, pixels: int) -> None:
+    if value is not None and not 0 <= value <= pixels:
+        raise PageError(f"{name} must be inside the image: between 0 and {pixels} pixels.")
 
 
-def _of_images(given: CameraFields, size: tuple[int, int]) -> Request:
+def _lens(given: CameraFields, size: Size) -> dict[str, float]:
+    """Return the entries of the focal length and the optical centre that are filled in."""
+    lens = {name: value for name, value in given.lens.items() if value is not None}
+    for name in ("fx", "fy"):
+        _check_positive(lens.get(name), name)
+    for name, pixels in zip(("cx", "cy"), size, strict=True):
+        _check_within(lens.get(name), name, pixels)
+    return lens
+
+
+def _of_images(given: CameraFields, sizes: Sequence[Size]) -> Request:
     """Return the request to estimate the cameras: their focal length, and the scale."""
     if not can_estimate():
         raise PageError(NO_POSELIB)
-    focal, assumed = _focal(given, size)
-    scaled = {"measured": _by_baseline, "known": _by_length, "guess": _by_guess}[given.scale_input](given)
+    focal, assumed = _focal(given, sizes[0])
+    make = {"measured": _by_baseline, "known": _by_length, "guess": _by_guess}[given.scale_input]
+    scaled = make(given, sizes[0])
     options = replace(scaled.options, estimate_pose=True, **focal)
     return replace(scaled, options=options, assumptions=(*assumed, *scaled.assumptions))
 
 
-def _focal(given: CameraFields, size: tuple[int, int]) -> tuple[dict[str, Any], tuple[Finding, ...]]:
+def _focal(given: CameraFields, size: Size) -> tuple[dict[str, Any], tuple[Finding, ...]]:
     """Return the options of the focal length, and what is assumed about it."""
     if given.camera == "exif":
         return {}, ()
     if given.camera == "fx":
         if given.lens.get("fx") is None:
             raise PageError("Enter fx, the focal length in pixels, or choose your camera in the list.")
-        return _lens(given), ()
+        return _lens(given, size), ()
     if given.camera == "fov":
         if given.fov is None or not 1 <= given.fov <= 170:
             raise PageError("Enter the field of view across the width of the image, 1 to 170 degrees.")
@@ -302,7 +320,7 @@ def _focal(given: CameraFields, size: tuple[int, int]) -> tuple[dict[str, Any], 
     return {"fov": fov}, (Finding("camera.from-list", text),)
 
 
-def _by_baseline(given: CameraFields) -> Request:
+def _by_baseline(given: CameraFields, size: Size) -> Request:
     if given.baseline is None:
         raise PageError(
             "Images alone have no scale. Enter the measured distance between the two positions, or choose a "
@@ -316,7 +334,7 @@ def _by_baseline(given: CameraFields) -> Request:
     )
 
 
-def _by_length(given: CameraFields) -> Request:
+def _by_length(given: CameraFields, size: Size) -> Request:
     """Return the request with the known length in the format of ``--known-length``."""
     if given.known_length is None:
         raise PageError("Images alone have no scale. Enter the known length.")
@@ -325,11 +343,14 @@ def _by_length(given: CameraFields) -> Request:
     if len(numbers) != 4:
         raise PageError("Mark both ends of the known length: tap them in the left image below its field.")
     x1, y1, x2, y2 = (math.floor(float(number) + 0.5) for number in numbers)
+    ends = [(x1, y1), (x2, y2)]
+    for end in ends:
+        check_inside(end, size, f"The end {end} of the known length")
     known = ",".join([*numbers, f"{given.known_length}"])
-    return replace(_request(known_length=known), pixels=[(x1, y1), (x2, y2)])
+    return replace(_request(known_length=known), pixels=ends)
 
 
-def _by_guess(given: CameraFields) -> Request:
+def _by_guess(given: CameraFields, size: Size) -> Request:
     check_choice(given.guess, "guess", GUESSES)
     metres, spread = GUESSES[given.guess]
     text = f"The distance between the cameras is a guess of {metres:g} m, ± {100 * spread:.0f} %."

@@ -31,7 +31,8 @@ class Message:
 
 
 _SWAP = "Swap the left and the right image, then run again."
-_CALIBRATION = "Check that the calibration file belongs to these two images."
+_CALIBRATION = "Check that the calibration belongs to these two images."
+_BASELINE = 'Use a file for both cameras, or choose "Focal length and baseline" and enter both.'
 _RETAKE = "Take two new images of a scene in which nothing moves."
 _LENGTH = "Check the distance between the cameras and its unit: the page expects metres."
 _WIDER = "Take the second image from a position further to the side."
@@ -224,7 +225,10 @@ FINDINGS_ON_PAGE: dict[str, tuple[str, str]] = {
         "The scene extends beyond the depths that you entered.",
         "Clear the fields 'Nearest depth' and 'Farthest depth'.",
     ),
-    "depth.off-matches": ("The depth does not fit the matched points.", "Choose the preset 'default'."),
+    "depth.off-matches": (
+        "The depth does not fit the matched points.",
+        "Choose a different prior, or take images with more overlap and texture.",
+    ),
     "depth.order-points": ("The prior contradicts the known depths.", "Choose a different prior."),
     "depth.occlusion": ("Far objects hide near ones. The left and right images are probably swapped.", _SWAP),
     "depth.order": (
@@ -260,10 +264,15 @@ ERRORS_ON_PAGE: dict[str, tuple[str, str]] = {
         "An image was cropped, so the focal length in its file is not valid.",
         "Use the original image, or choose your camera in the list if it was only resized.",
     ),
+    "file.empty": ("A file is empty.", "Export or download it again."),
     "calibration.size": ("The calibration is for images of a different size.", _CROP),
     "calibration.one-camera": (
         "The calibration file describes one camera.",
         "Add the file for the other camera, or estimate the camera positions from the images.",
+    ),
+    "calibration.no-baseline": (
+        "The calibration file does not state the distance between the cameras.",
+        _BASELINE,
     ),
     "camera.principal-point": ("The optical centre in the calibration is outside the image.", _CROP),
     "camera.focal-unit": ("The focal length is not in pixels.", "Enter fx in pixels of this image."),
@@ -289,7 +298,22 @@ ERRORS_ON_PAGE: dict[str, tuple[str, str]] = {
     "memory": ("The images do not fit in the memory of this server.", "Downscale both images."),
 }
 _UNKNOWN_FORMAT = ("The calibration file is in an unsupported format.", "")
-_OTHER = ("The images and their calibration cannot be used together.", _CALIBRATION)
+_OTHER = "The images and the camera parameters cannot be used together."
+#: Source of the cameras -> what to do if an error has no code.
+_OTHER_HINTS = {
+    "file": _CALIBRATION,
+    "numbers": "Check fx, fy, cx, cy and the distance between the cameras.",
+    "images": "Check the images, the focal length and the length that you entered.",
+}
+
+
+def check_inside(pixel: tuple[int, int], size: tuple[int, int], name: str) -> None:
+    """Raise ``PageError`` if a pixel ``(x, y)`` is outside of an image ``(width, height)``."""
+    (x, y), (width, height) = pixel, size
+    if not (0 <= x < width and 0 <= y < height):
+        raise PageError(
+            f"{name} is outside of the image: x goes from 0 to {width - 1}, y from 0 to {height - 1}."
+        )
 
 
 def on_page(finding: Finding, folders: Iterable[Path] = ()) -> Message:
@@ -298,13 +322,16 @@ def on_page(finding: Finding, folders: Iterable[Path] = ()) -> Message:
     return Message(text, hint, without_folders(str(finding), folders))
 
 
-def error_on_page(error: InputError, folders: Iterable[Path] = ()) -> Message:
-    """Return the page's sentence for an input error, with the command's message as detail."""
+def error_on_page(error: InputError, folders: Iterable[Path] = (), camera_input: str = "") -> Message:
+    """Return the page's sentence for an input error, with the command's message as detail.
+
+    ``camera_input`` is the source of the cameras, a key of ``job.CAMERA_INPUTS``, if it is known.
+    """
     if isinstance(error, PageError):
         return Message(str(error))
     if isinstance(error, UnknownFormatError):
         return Message(*_UNKNOWN_FORMAT)
-    text, hint = ERRORS_ON_PAGE.get(error.code, _OTHER)
+    text, hint = ERRORS_ON_PAGE.get(error.code, (_OTHER, _OTHER_HINTS.get(camera_input, "")))
     return Message(text, hint, without_folders(str(error), folders))
 
 

@@ -74,6 +74,7 @@ class Panels:
     scene_data: gr.HTML
     marks_data: gr.HTML
     headline: gr.HTML
+    depth_headline: gr.HTML
     depth: gr.HTML
     legend: gr.HTML
     readings: gr.HTML
@@ -115,7 +116,8 @@ def _failed(error: Exception, request: Request | None = None) -> str:
     if isinstance(error, InputError):
         options = None if request is None else request.options
         paths = () if options is None else (*options.image_files().values(), *options.calib)
-        message = error_on_page(error, {path.parent for path in paths})
+        camera_input = "" if request is None else request.camera_input
+        message = error_on_page(error, {path.parent for path in paths}, camera_input)
         link = templates.LINK_TO_FORMATS if isinstance(error, UnknownFormatError) else ""
         return templates.failed(message, link)
     traceback.print_exception(error, file=sys.stderr)
@@ -129,9 +131,14 @@ def _measured(result: Result) -> dict[str, str]:
     found = Measurement.of(result)
     return {
         "marks_data": templates.hidden(found.marks()),
-        "headline": found.headline(),
+        **_headlines(found.headline()),
         "readings": found.html(),
     }
+
+
+def _headlines(html: str) -> dict[str, str]:
+    """Return the line with the last measurement, which is above the 3D view and above the depth map."""
+    return {"headline": html, "depth_headline": html}
 
 
 def _depth(result: Result) -> dict[str, str]:
@@ -181,7 +188,7 @@ def drawn(result: Result, tab: str = "") -> Iterator[dict[str, str]]:
 def _nothing(status: str) -> dict[str, str]:
     """Return the HTML of the panels without a result; ``status`` states the reason."""
     empty = dict.fromkeys(("scene_data", "marks_data", "depth", "legend", "confidence"), "")
-    empty |= {"headline": templates.headline("", "No result yet."), "files": templates.WAITING}
+    empty |= _headlines(templates.headline("", "No result yet.")) | {"files": templates.WAITING}
     return empty | {"readings": templates.HOW_TO_MEASURE, "status": status}
 
 
@@ -344,18 +351,21 @@ class _Handlers:
         session = self.sessions.of(request.session_hash)
         if not session.secret and session.run is None:
             session.secret = secret  # the connection was lost and the session forgotten
-        result = self.sessions.store.get(secret) if secret else session.first
-        if result is None:
-            return {self.panels.readings: templates.failed(Message(templates.EXPIRED))}
         if secret != session.secret:
             return {self.panels.readings: gr.skip()}
+        result = self.sessions.result(session)
+        if result is None:
+            expired = templates.failed(Message(templates.EXPIRED))
+            hint = _headlines(templates.headline("", templates.EXPIRED))
+            return self.on_panels({"status": expired, "readings": expired, **hint})
         try:
             result.pixels[:] = change(result)
         except PageError as error:
             html = Measurement.of(result).html()
             message = templates.note(error_on_page(error))
-            hint = templates.headline("", str(error))
-            return self.on_panels({"readings": message + html, "headline": hint})
+            return self.on_panels(
+                {"readings": message + html, **_headlines(templates.headline("", str(error)))}
+            )
         return self.on_panels(_measured(result))
 
     def add_point(self, request: gr.Request, secret: str, typed: str) -> dict[Any, Any]:
@@ -453,7 +463,7 @@ def _wire_form(desk: _Handlers, examples: gr.Gallery) -> None:
 def _wire_measuring(desk: _Handlers) -> None:
     """Connect the handlers of measured points: clicks in the 3D view or on the image, and typed pixels."""
     panels, secret = desk.panels, desk.secret
-    measured = [panels.marks_data, panels.headline, panels.readings]
+    measured = [panels.marks_data, panels.headline, panels.depth_headline, panels.readings, panels.status]
     in_order = IN_ORDER | {"concurrency_id": "points"}
     panels.pick.click(desk.add_point, [secret, panels.picked], measured, js=templates.PICKED, **in_order)
     typed = [panels.add.click, panels.pixel.submit]
@@ -483,6 +493,7 @@ def _build_panels(html: dict[str, str]) -> Panels:
             gr.HTML(templates.VIEWER, elem_id="scene")
             _point_buttons(drawn)
         with gr.Tab("Depth"):
+            drawn["depth_headline"] = gr.HTML(html["depth_headline"], elem_id="depth-headline")
             drawn["depth"] = gr.HTML(html["depth"], elem_id="depth")
             drawn["legend"] = gr.HTML(html["legend"], elem_id="depth-legend")
         with gr.Tab("Measure"), gr.Row():

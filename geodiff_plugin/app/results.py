@@ -12,18 +12,19 @@ from dataclasses import dataclass
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
-from zipfile import ZIP_STORED, ZipFile
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 from PIL import Image
 
 from geodiff_plugin.app import templates
-from geodiff_plugin.app.messages import PageError
+from geodiff_plugin.app.messages import PageError, check_inside
 from geodiff_plugin.app.sessions import Result
 from geodiff_plugin.app.shown import Shown, visible_in_viewer
 from geodiff_plugin.cameras import PosedCamera
 from geodiff_plugin.formats import MAX_16_BITS, REPORT
 from geodiff_plugin.formats.clouds import CAMERA_COLOURS, EDGES, PYRAMID_FRACTION, camera_pyramid
+from geodiff_plugin.jobs import limit_words
 from geodiff_plugin.plotting import colour_depth, colour_fraction, depth_range, ticks
 from geodiff_plugin.result.readings import Reading, metres
 
@@ -38,6 +39,8 @@ LEGEND_STOPS = 24
 ARCHIVE = "result.zip"
 #: Suffix of arrays, which are not in the archive: they hardly compress, and most visitors need none.
 ARRAYS = ".npy"
+#: Suffixes of files that are compressed in the archive, fast; images are compressed already.
+COMPRESSED = (".glb", ".ply")
 #: Name of the table with the visitor's measurements.
 MEASUREMENTS = "measurements.csv"
 #: File for download -> purpose; in the order of the page.
@@ -110,9 +113,12 @@ def data_url(pixels: np.ndarray) -> str:
 def check_pixel(shown: Shown, pixel: tuple[int, int]) -> None:
     """Raise ``PageError`` for a pixel outside the image, or without depth."""
     (x, y), (height, width) = pixel, shown.depth_m.shape
-    if not (0 <= x < width and 0 <= y < height):
+    check_inside(pixel, (width, height), f"({x}, {y})")
+    if shown.beyond is not None and shown.measurable_m is not None and shown.beyond[y, x]:
+        limit = limit_words(shown.measurable_m, "m")
         raise PageError(
-            f"({x}, {y}) is outside of the image: x goes from 0 to {width - 1}, y from 0 to {height - 1}."
+            f"({x}, {y}) is too far to be measured: these cameras measure depths up to {limit}. "
+            "Choose a nearer point."
         )
     if not (np.isfinite(shown.depth_m[y, x]) and shown.depth_m[y, x] > 0):
         raise PageError(f"({x}, {y}) has no depth. Choose a point on a nearby surface.")
@@ -290,8 +296,9 @@ def files_of(result: Result) -> list[Path]:
     *wanted, last = PURPOSES
     paths = [folder / name for name in (*wanted, *sorted(own.difference(PURPOSES)), last) if name in own]
     if archive_is_old or not (folder / ARCHIVE).exists():
-        with ZipFile(folder / ARCHIVE, "w", ZIP_STORED) as archive:
+        with ZipFile(folder / ARCHIVE, "w", compresslevel=1) as archive:
             for path in paths:
                 if path.suffix != ARRAYS:
-                    archive.write(path, path.name)
+                    kind = ZIP_DEFLATED if path.suffix in COMPRESSED else ZIP_STORED
+                    archive.write(path, path.name, kind)
     return [folder / ARCHIVE, *paths]

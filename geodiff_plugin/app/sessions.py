@@ -183,7 +183,12 @@ class Sessions:
                 raise Stopped
             before = session.secret
             session.secret = self.store.add(Result(shown, pixels))
-        self.store.drop(before)
+        if not self._is_shown(before):
+            self.store.drop(before)
+
+    def _is_shown(self, secret: str) -> bool:
+        """Whether an open tab shows this result, such as the duplicate of a tab that no longer does."""
+        return any(session.secret == secret for session in list(self._of.values()))
 
     def leave(self, name: str | None) -> None:
         """Stop a session's run, delete its uploads unless shared, and expire its result in ``RELOAD_S``."""
@@ -192,7 +197,7 @@ class Sessions:
             return
         session.stop()
         delete_uploads(session.uploads.difference(*(other.uploads for other in self._of.values())))
-        if all(other.secret != session.secret for other in self._of.values()):  # a reloaded tab uses it again
+        if not self._is_shown(session.secret):  # a reloaded tab uses it again
             self.store.end_in(session.secret, RELOAD_S)
 
 

@@ -12,7 +12,17 @@ import numpy as np
 from geodiff_plugin.cameras import PosedCamera
 from geodiff_plugin.findings import Finding, dedupe
 from geodiff_plugin.formats import MM_PER_METRE, REPORT, flying_points, in_8_bits, read_image, sigma_mm
-from geodiff_plugin.jobs import PairResult, PairRun, cameras_of, depth_range_words, output_summary, single_map
+from geodiff_plugin.jobs import (
+    PairResult,
+    PairRun,
+    beyond_limit,
+    cameras_of,
+    depth_range_words,
+    measurable_limit,
+    measured_depth,
+    output_summary,
+    single_map,
+)
 from geodiff_plugin.result.readings import Reading, distance_m, read_pixel
 from geodiff_plugin.trust import KINDS, Tone, TrustSummary, summarise
 
@@ -39,7 +49,7 @@ class Shown:
 
     name: str  # of the pair
     image: np.ndarray  # (H, W, 3) uint8
-    depth_m: np.ndarray  # float32
+    depth_m: np.ndarray  # float32; 0 where it is unknown or too far to be measured
     views: tuple[PosedCamera, ...]
     trust: TrustSummary
     messages: tuple[Finding, ...]  # not in the summary
@@ -48,6 +58,8 @@ class Shown:
     confidence: np.ndarray | None = None  # in [0, 1]
     sigma_m: np.ndarray | None = None  # standard deviation of the depth, except for the scale's
     scale_rel_std: float | None = None  # relative standard deviation of the scale
+    beyond: np.ndarray | None = None  # bool, pixels too far to be measured
+    measurable_m: float | None = None  # the farthest measurable depth
     uploads: tuple[Path, ...] = ()  # folders of the inputs, which messages do not state
     folder: Path | None = None  # of the files for download
     precomputed: bool = False
@@ -94,7 +106,7 @@ def shown_of(run: PairRun, name: str, scale_rel_std: float | None = None) -> Sho
     return Shown(
         name=name,
         image=in_8_bits(inputs.left),
-        depth_m=single_map(output.prediction).astype(np.float32),
+        depth_m=measured_depth(output).astype(np.float32),
         views=cameras_of(output, inputs.guidance),
         trust=trust,
         messages=tuple(m for m in messages if m not in (*trust.reasons, *repeated)),
@@ -103,6 +115,8 @@ def shown_of(run: PairRun, name: str, scale_rel_std: float | None = None) -> Sho
         confidence=maps["confidence"],
         sigma_m=maps["sigma"],
         scale_rel_std=output.scale_rel_std if scale_rel_std is None else scale_rel_std,
+        beyond=beyond_limit(single_map(output.prediction), measurable_limit(output)),
+        measurable_m=measurable_limit(output),
         uploads=tuple({path.parent for path in _files(run)}),
     )
 
@@ -162,8 +176,12 @@ def visible_in_viewer(shown: Shown) -> np.ndarray:
 
 
 def save(path: Path, shown: Shown, pixels: Pixels) -> None:
-    """Write a result with its measured pixels, without its image and files."""
+    """Write a result with its measured pixels, without its image and files.
+
+    All its pixels with a depth are within the measurable range.
+    """
     assert shown.confidence is not None and shown.sigma_m is not None
+    assert shown.beyond is None or not shown.beyond.any()
     stored = {
         "pixels": pixels,
         "views": [[view.K.tolist(), view.E.tolist(), view.size] for view in shown.views],

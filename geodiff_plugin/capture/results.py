@@ -303,15 +303,16 @@ def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[
 
 
 def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
-    """Write a video of every frame next to its depth; all share one colour range and size (padded)."""
+    """Write a video of every frame next to its depth and a colour bar, all of one range and size (padded)."""
     maps = [np.load(out / name / "depth.npy", mmap_mode="r") for name in names]
     near, far = plotting.depth_range(np.concatenate([depth[::8, ::8].reshape(-1) for depth in maps])[None])
 
     def frames() -> Iterator[Image.Image]:
         for name, depth in zip(names, maps, strict=True):
+            drawn = plotting.depth_figure(depth, near, far, unit=capture.unit)
             photo = plotting.as_rgb_image(capture.image(name))
-            drawn = plotting.colour_depth(depth, near, far)
-            yield ImageOps.pad(Image.fromarray(np.hstack([np.asarray(photo), drawn])), VIDEO_SIZE)
+            photo = photo.resize((round(photo.width * drawn.height / photo.height), drawn.height))
+            yield ImageOps.pad(Image.fromarray(np.hstack([np.asarray(photo), np.asarray(drawn)])), VIDEO_SIZE)
 
     try:
         plotting.write_depth_video(out / "video.mp4", frames(), VIDEO_FPS)

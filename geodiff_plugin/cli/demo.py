@@ -29,6 +29,7 @@ from geodiff_plugin.jobs import (
     collected_warnings,
     depth_pair,
     depth_pairs,
+    figure_range,
     load_guided_prior,
     prior_of_options,
     say,
@@ -105,9 +106,9 @@ def run_real_demo(pairs: Sequence[DepthOptions], out: Path) -> None:
             with start_pair(options) as folder:
                 result = depth_pair(options, pipe, folder=folder, notify=notify, progress=not options.quiet)
             print(summary_line(result.report, f"{folder.path}/"))
-            depth_m = single_map(result.run.output.prediction)
-            cells += [result.run.inputs.left, colour_depth(depth_m)]
-            ranges.append(depth_range(depth_m))
+            ends = figure_range(result.run.output)
+            cells += [result.run.inputs.left, colour_depth(single_map(result.run.output.prediction), *ends)]
+            ranges.append(ends)
             titles += [name, "depth"]
     _write_comparison(out, cells, titles, ranges, columns=2)
     print(f"Open {out / COMPARISON} first: each left image next to its depth.")

@@ -266,8 +266,11 @@ def _answer(sample: StereoSample, name: str, settings: Settings, priors: PriorCa
 
 def _rows(
     sample: StereoSample, answers: Sequence[_Answer], clouds: bool
-) -> tuple[list[np.ndarray], list[str]]:
-    """Return titled images of a sample: left image and depths, ground truth and errors, clouds."""
+) -> tuple[list[np.ndarray], list[str], list[tuple[float, float] | None]]:
+    """Return titled images of a sample: left image and depths, ground truth and errors, clouds.
+
+    The last list has the range of the colours of each of these rows, if it needs a bar.
+    """
     ground_truth = np.where(sample.valid, sample.depth_m, np.nan)
     near, far = depth_range(ground_truth)
     depths = [answer.depth_m for answer in answers]
@@ -289,7 +292,7 @@ def _rows(
             render_cloud(depth_m, sample.left, sample.K_left, view) for depth_m in (ground_truth, *depths)
         ]
         titles += ["view from above left"] * (1 + len(answers))
-    return images, titles
+    return images, titles, [(near, far), None, *[None] * clouds]
 
 
 def draw_side_by_side(shown: Sequence[str], options: FigureOptions) -> Drawing:
@@ -298,13 +301,15 @@ def draw_side_by_side(shown: Sequence[str], options: FigureOptions) -> Drawing:
     priors = PriorCache()
     cells = list[np.ndarray]()
     titles = list[str]()
+    ranges = list[tuple[float, float] | None]()
     numbers = dict[str, Any]()
     for sample in [load(ref).check_ground_truth() for ref in select(options)]:
         answers = [_answer(sample, name, options.settings, priors) for name in methods]
-        images, headings = _rows(sample, answers, options.clouds)
-        cells, titles = cells + images, titles + headings
+        images, headings, of_rows = _rows(sample, answers, options.clouds)
+        cells, titles, ranges = cells + images, titles + headings, ranges + of_rows
         numbers[sample.label] = {n: a.abs_rel for n, a in zip(methods, answers, strict=True)}
-    return Drawing(grid(cells, titles, columns=1 + len(methods)), {"abs_rel": numbers})
+    sheet = grid(cells, titles, columns=1 + len(methods), depth_ranges=ranges)
+    return Drawing(sheet, {"abs_rel": numbers})
 
 
 def draw_risk_coverage(options: FigureOptions) -> Drawing:

@@ -73,7 +73,7 @@ def check_file(path: PathLike, name: str, what: str = "a file") -> Path:
     if not os.access(file, os.R_OK):
         bad_value(name, what, f"{path}, which is not readable", "Check its permissions.", InputFileError)
     if file.stat().st_size == 0:
-        bad_value(name, what, f"{path}, which is empty", "Download or copy it again.")
+        bad_value(name, what, f"{path}, which is empty", "Download or copy it again.", code="file.empty")
     _raise_placeholder(file, name, what)
     return file
 
@@ -229,7 +229,8 @@ def read_text(path: PathLike, name: str, what: str = "a text file") -> str:
     wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # written by PowerShell and Notepad
     text = raw.decode("utf-16" if wide else "utf-8-sig", errors="replace")
     if "\0" in text or not text.strip():
-        bad_value(name, what, f"{file}, which holds {'binary data' if text.strip() else 'only blanks'}", hint)
+        content, code = ("binary data", "") if text.strip() else ("only blanks", "file.empty")
+        bad_value(name, what, f"{file}, which holds {content}", hint, code=code)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

@@ -292,12 +292,14 @@ def _check_complete(named: Entries, arrays: Arrays) -> None:
     if not missing:
         return
     hint = f"If intrinsics and extrinsics are in several files, pass all of them. {RENAME}"
+    code = "calibration.no-baseline" if set(missing) <= {"R", "T"} else ""
     if {"K1", "K2"} <= set(missing) and _has(dict(arrays), "K"):
+        code = "calibration.one-camera"
         hint = "It has a single camera. Pass the stereo calibration, or K and E of the pair (--K, --E)."
     listed = [f"{key} ({v.size})" for key, v in arrays if v.size in SIZES]
     others = f" among {', '.join(listed[:MAX_LISTED])}" if listed else ""
     expected = "a calibration with P1, P2, or with K1, K2, R, T"
-    bad_value("the file", expected, f"no {', '.join(missing)}{others}", hint)
+    bad_value("the file", expected, f"no {', '.join(missing)}{others}", hint, code=code)
 
 
 def _parallel(named: Entries, arrays: Arrays, size: Any) -> Rig:

@@ -71,7 +71,8 @@ def _raise_file_count(entry: CalibrationFormat, files: list[Path]) -> NoReturn:
     once = "Pass a file of both cameras once; for single-camera files pass K and E of the pair."
     expected = f"{counts} {noun} of this format, {entry.summary}"
     got = f"{len(files)}, {' and '.join(map(str, files))}"
-    bad_value("calibration", expected, got, both if len(files) == 1 else once)
+    hint, code = (both, "calibration.one-camera") if len(files) == 1 else (once, "")
+    bad_value("calibration", expected, got, hint, code=code)
 
 
 def _with_companions(entry: CalibrationFormat, texts: dict[Path, str]) -> tuple[str, ...]:

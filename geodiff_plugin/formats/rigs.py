@@ -137,12 +137,14 @@ def reading_file(
     except InputFileError:
         raise
     except InputError as error:
-        raise_input_error(f"{source}: {error}")
+        raise_input_error(f"{source}: {error}", code=error.code)
     except Exception as error:  # any error that a damaged file may cause
         got = str(error) if isinstance(error, ValueError) else "other entries"
         got = f"no {error}" if isinstance(error, KeyError) else got
         cut = _ended_early(error) or any(map(is_cut_off, texts))
-        bad_value(str(source), f"a whole {summary}", got, "The file seems truncated." if cut else hint)
+        hint = "The file seems truncated." if cut else hint
+        code = "" if cut or str(error) != repr("baseline") else "calibration.no-baseline"
+        bad_value(str(source), f"a whole {summary}", got, hint, code=code)
 
 
 def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -105,7 +105,9 @@ def read_foundation_stereo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         )
     if len(K) != 9:
         hint = "Add the baseline as a second line, or pass a file with only K or E as K and E (--K, --E)."
-        bad_value("the file", "9 numbers of K and the baseline in metres", f"{len(K) + 1} numbers", hint)
+        code = "calibration.no-baseline" if len(K) == 8 else ""  # K alone
+        got = f"{len(K) + 1} numbers"
+        bad_value("the file", "9 numbers of K and the baseline in metres", got, hint, code=code)
     return make_rig(RawCamera(K), RawCamera(K), baseline_m)
 
 
@@ -121,7 +123,9 @@ def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     baseline_m = data[named] if named else choice.baseline_m
     if baseline_m is None:
         hint = "For parallel cameras, pass their distance in metres (--baseline, baseline_m)."
-        bad_value("the file", f"one with {' or '.join(BASELINES)}", "none", hint)
+        bad_value(
+            "the file", f"one with {' or '.join(BASELINES)}", "none", hint, code="calibration.no-baseline"
+        )
     return make_rig(left, right, baseline_m)
 
 

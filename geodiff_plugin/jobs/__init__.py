@@ -75,7 +75,11 @@ if TYPE_CHECKING:  # public names; imported on first use at run time, because so
     from geodiff_plugin.jobs.records import PairInputs as PairInputs
     from geodiff_plugin.jobs.records import PairResult as PairResult
     from geodiff_plugin.jobs.records import PairRun as PairRun
+    from geodiff_plugin.jobs.report import beyond_limit as beyond_limit
     from geodiff_plugin.jobs.report import depth_range_words as depth_range_words
+    from geodiff_plugin.jobs.report import limit_words as limit_words
+    from geodiff_plugin.jobs.report import measurable_limit as measurable_limit
+    from geodiff_plugin.jobs.report import measured_depth as measured_depth
     from geodiff_plugin.jobs.report import output_summary as output_summary
     from geodiff_plugin.jobs.report import report_text as report_text
     from geodiff_plugin.jobs.report import single_map as single_map
@@ -89,6 +93,7 @@ if TYPE_CHECKING:  # public names; imported on first use at run time, because so
     from geodiff_plugin.jobs.stopping import ending_on_sigterm as ending_on_sigterm
     from geodiff_plugin.jobs.tables import merge_shards as merge_shards
     from geodiff_plugin.jobs.writing import cameras_of as cameras_of
+    from geodiff_plugin.jobs.writing import figure_range as figure_range
     from geodiff_plugin.jobs.writing import write_pair as write_pair
 
 _MODULE_OF = declared(__name__)

@@ -60,8 +60,25 @@ def single_map(value: Any) -> np.ndarray:
 def output_summary(output: MetricDepthOutput) -> dict[str, Any]:
     """Return the ``depth_summary`` of an output with one image."""
     visible = None if output.visible is None else single_map(output.visible)
-    measurable_m = None if output.measurable_m is None else float(output.measurable_m[0])
-    return depth_summary(single_map(output.prediction), visible, single_map(output.valid), measurable_m)
+    depth_m, valid = single_map(output.prediction), single_map(output.valid)
+    return depth_summary(depth_m, visible, valid, measurable_limit(output))
+
+
+def measurable_limit(output: MetricDepthOutput) -> float | None:
+    """Return the farthest measurable depth of an output with one image, ``None`` if unknown."""
+    return None if output.measurable_m is None else float(output.measurable_m[0])
+
+
+def beyond_limit(depth_m: np.ndarray, measurable_m: float | None) -> np.ndarray:
+    """Return the mask ``(H, W)`` of depths that are too far to be measured, as in the sky."""
+    return np.isfinite(depth_m) & (depth_m > (math.inf if measurable_m is None else measurable_m))
+
+
+def measured_depth(output: MetricDepthOutput) -> np.ndarray:
+    """Return the depth of an output with one image, ``(H, W)``; 0 where it is invalid or too far."""
+    depth_m = single_map(output.prediction)
+    measured = single_map(output.valid) & ~beyond_limit(depth_m, measurable_limit(output))
+    return np.where(measured, depth_m, 0.0)
 
 
 def depth_summary(
@@ -78,7 +95,7 @@ def depth_summary(
     """
     has_depth = np.isfinite(depth_m) & (depth_m > 0)
     valid = has_depth if valid is None else has_depth & valid
-    beyond = has_depth & (depth_m > (math.inf if measurable_m is None else measurable_m))
+    beyond = beyond_limit(depth_m, measurable_m)
     kept, measured = (
         depth_m[mask] if mask.any() else np.array([math.nan]) for mask in (valid, valid & ~beyond)
     )
@@ -205,13 +222,18 @@ def _length(value: float, unit: str | None) -> str:
     return number if unit is None else f"{number} {unit}"
 
 
+def limit_words(measurable_m: float, unit: str | None) -> str:
+    """Format the farthest measurable depth with two significant digits."""
+    return f"{float(f'{measurable_m:.2g}'):g}" + ("" if unit is None else f" {unit}")
+
+
 def depth_range_words(depth: Mapping[str, Any], unit: str | None) -> str:
     """Format the range of a ``depth_summary``, such as ``3.24 m to beyond 71 m``."""
     near = _length(depth["min_m"], unit)
     beyond_m = depth.get("beyond_m")
     if beyond_m is None:
         return f"{near} to {_length(depth['max_m'], unit)}"
-    far = f"beyond {float(f'{beyond_m:.2g}'):g}" + ("" if unit is None else f" {unit}")
+    far = f"beyond {limit_words(beyond_m, unit)}"
     nothing_measured = depth["max_m"] is None or math.isnan(depth["max_m"])
     return far if nothing_measured else f"{near} to {far}"
 

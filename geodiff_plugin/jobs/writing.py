@@ -18,7 +18,7 @@ from geodiff_plugin.jobs.finished import Row, row_of
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, LiveOptions, unique_names
 from geodiff_plugin.jobs.records import PairInputs, PairResult, PairRun
-from geodiff_plugin.jobs.report import build_report, report_text, single_map, used_poses
+from geodiff_plugin.jobs.report import build_report, measured_depth, report_text, single_map, used_poses
 from geodiff_plugin.result.output import MetricDepthOutput
 
 #: Files with the depth in the camera of ``--reproject``, in metres (float) and whole millimetres.
@@ -84,7 +84,8 @@ def write_maps(
     formats.write_depth_npy(folder / "depth.npy", depth_m)
     valid = single_map(output.valid)
     zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m * valid)
-    depth = _save_figure(plotting.depth_figure(depth_m, unit=output.unit), folder / "depth.png")
+    figure = plotting.depth_figure(depth_m, *figure_range(output), unit=output.unit)
+    depth = _save_figure(figure, folder / "depth.png")
     maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
     names = ("photometric_error", "uncertainty", "confidence", "sigma")
     maps |= {name: single_map(x) for name in names if (x := getattr(output, name)) is not None}
@@ -141,6 +142,12 @@ def write_previews(
     K = np.reshape(report["K"], (3, 3))
     cloud = folder / "cloud.ply"
     return formats.write_ply(cloud, depth, left, K, valid=valid, unit=report["unit"], sigma_m=sigma)
+
+
+def figure_range(output: MetricDepthOutput) -> tuple[float, float]:
+    """Return the depths at the ends of a figure's colours; depths that were not measured do not count."""
+    measured_m = measured_depth(output)
+    return plotting.depth_range(measured_m if (measured_m > 0).any() else single_map(output.prediction))
 
 
 def _thinned(kept: np.ndarray, max_points: int | None) -> np.ndarray:

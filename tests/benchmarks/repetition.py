@@ -28,7 +28,7 @@ from geodiff_plugin.evidence import prepare
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
 from tests.scenes.layouts.repeated import PATTERNS
 
-__all__ = ["Scores", "mean_scores", "scores_of"]
+__all__ = ["Scores", "mean_scores", "score", "scores_of"]
 
 #: Confidence of pixels that count as sure.
 SURE = 0.9
@@ -62,7 +62,8 @@ def mean_scores(pairs: Sequence[Scores]) -> Scores:
     return Scores(**{name: float(np.mean([vars(each)[name] for each in pairs])) for name in vars(pairs[0])})
 
 
-def _score(pipe: Any, sample: Any) -> Scores:
+def score(pipe: Any, sample: Any) -> Scores:
+    """Score a guided call with seed 0 on a pair with ground truth."""
     guidance = GeometryGuidance(sample.right, (sample.K_left, sample.K_right), sample.E)
     image, generator = Image.fromarray(sample.left), torch.Generator().manual_seed(0)
     out = pipe(image, guidance=guidance, generator=generator)
@@ -98,8 +99,8 @@ def main() -> None:
     for ref in tqdm(find_pairs(f"synthetic-repeated:{arguments.pairs}@{arguments.size}")):
         sample, seed = load(ref), ref.files["seed"]
         with patch.object(prepare, "with_repetition", lambda matches, volume: matches):
-            without = _score(pipe, sample)
-        pair = without, _score(pipe, sample)
+            without = score(pipe, sample)
+        pair = without, score(pipe, sample)
         kind = "posed" if ref.files["posed"] else "rectified"
         for row in (list(PATTERNS)[seed // 2 % len(PATTERNS)], f"all {kind}", "all"):
             found.setdefault(row, []).append(pair)

@@ -32,19 +32,25 @@ def chromium():
 
 
 @pytest.fixture(scope="session")
-def address(chromium, tmp_path_factory):
-    """Address of ``geodiff app`` in a process of its own."""
+def server(chromium, tmp_path_factory):
+    """Address of ``geodiff app`` in a process of its own, and the file with its output."""
     pytest.importorskip("gradio", reason="gradio is not installed")
     folder, port = tmp_path_factory.mktemp("app"), free_port()
     command = [sys.executable, "-m", "geodiff_plugin", "app", "--device", "cpu", "--port", str(port)]
     with served(command, port, folder) as url:
-        yield url
+        yield url, folder / "log.txt"
+
+
+@pytest.fixture(scope="session")
+def address(server):
+    """Address of ``geodiff app`` in a process of its own."""
+    return server[0]
 
 
 @pytest.fixture
 def visitor(chromium, address):
-    """``visitor()`` opens the page as another visitor; what it asks of other hosts is a failure."""
-    contexts, foreign = [], []
+    """``visitor()`` opens the page as another visitor; foreign requests and exceptions are failures."""
+    contexts, foreign, errors = [], [], []
 
     def note(request) -> None:
         if not request.url.startswith((address, "data:", "blob:")):
@@ -60,6 +66,7 @@ def visitor(chromium, address):
         context.set_default_timeout(60_000)  # of a machine that does other things as well
         page = context.new_page()
         page.on("request", note)
+        page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(address)
         page.wait_for_selector("#run")
         return page
@@ -67,7 +74,7 @@ def visitor(chromium, address):
     yield come
     for context in contexts:
         context.close()
-    assert foreign == []
+    assert foreign == [] and errors == []
 
 
 @pytest.fixture(scope="session")

@@ -1,12 +1,14 @@
 """Whole visits: stale state, swapped images, images without a calibration, and the 3D view under touch."""
 
 import hashlib
+import io
 import json
 import random
 import re
 import shutil
 import time
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -209,6 +211,30 @@ def test_swapped_images_are_rejected_with_the_swap_as_first_reason(visitor, tmp_
     )
 
 
+def test_sky_is_not_measured_and_the_legend_ends_at_the_measurable_range(visitor):
+    page = visitor()
+    click_example(page, LABELS.index("Street"))
+    page.wait_for_selector("#status .verdict:not(.example) .figures", timeout=RUN_MS)
+    idle(page)
+    limit = float(re.search(r"beyond (\d+) m", page.locator("#status .figures").inner_text()).group(1))
+    tab(page, "Measure")
+    field(page, "pixel").fill("240, 4")
+    page.keyboard.press("Enter")
+    message = page.wait_for_selector("#readings .error").inner_text()
+    assert "(240, 4) is too far to be measured" in message and f"up to {limit:g} m" in message
+    assert marks(page) == []
+    tab(page, "Depth")
+    labels = page.locator("#depth-legend .legend-ticks span").all_inner_texts()
+    assert labels and max(float(label.removesuffix(" m")) for label in labels) <= limit
+    page.wait_for_selector("#depth-headline >> text=is too far to be measured")
+    image = page.locator(".compare .images").bounding_box()
+    page.mouse.click(image["x"] + 0.5 * image["width"], image["y"] + 0.9 * image["height"])
+    page.wait_for_selector("#depth-headline .distance")
+    page.mouse.click(image["x"] + 0.54 * image["width"], image["y"] + 0.012 * image["height"])
+    page.wait_for_selector("#depth-headline >> text=is too far to be measured")
+    assert len(marks(page)) == 1
+
+
 def test_an_empty_3d_view_states_why_it_is_empty(visitor):
     page = visitor()
     page.wait_for_selector(".viewer-count >> text=% of the pixels")
@@ -221,6 +247,30 @@ def test_an_empty_3d_view_states_why_it_is_empty(visitor):
     page.locator(".viewer canvas").click()  # and a click in it does nothing
     slider.fill("50")
     page.wait_for_selector(".viewer-empty", state="hidden")
+
+
+def test_clicks_in_a_3d_view_whose_result_is_gone_do_nothing(visitor):
+    """The data are emptied, as after a failed run without an earlier result."""
+    page = visitor()
+    page.wait_for_selector(".viewer-count >> text=% of the pixels")
+    page.evaluate("document.querySelector('#scene-data .page-data').textContent = ''")
+    page.wait_for_selector(".viewer-empty >> text=There is no result to show.")
+    canvas = page.locator(".viewer canvas")
+    box = canvas.bounding_box()
+    for x, y in ((0.5, 0.5), (0.3, 0.6)):
+        page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.6 * box["height"], steps=4)
+    page.mouse.up()
+    for key in ("ArrowLeft", "Shift+ArrowLeft", "+", "-"):
+        canvas.press(key)
+    page.locator(".viewer [name=confidence]").fill("80")
+    page.locator(".viewer [name=points]").check()
+    page.locator(".viewer [name=reset]").click()
+    tab(page, "Measure")
+    page.wait_for_timeout(500)
+    assert len(marks(page)) == 2
 
 
 def test_a_phone_begins_with_the_images_alone_and_asks_for_what_they_lack(visitor, pair_without_exif):
@@ -277,12 +327,30 @@ def test_a_camera_of_the_list_and_a_known_length_are_named_and_drawn(visitor, pa
     field(page, "known_length").fill("50 cm")
     run(page)
     idle(page)
+    assert page.locator("#status .verdict.caution").count() == 1, "amber: the result rests on an assumption"
     assert any(
         "manufacturer" in text for text in page.locator("#status .verdict > ul > li").all_inner_texts()
     )
     assert [point["px"] for point in marks(page)] == [typed[:2], typed[2:]], "the measured object is drawn"
     length = float(re.search(NUMBER, page.locator("#headline .distance").inner_text()).group(1))
     assert length == pytest.approx(0.5, rel=0.15)
+
+
+def test_the_accuracy_of_a_tape_measure_widens_every_length(visitor, pair_without_exif):
+    page = visitor()
+    upload(page, pair_without_exif)
+    page.get_by_label("Estimate from the images").click()
+    choose(page, "camera", "Enter the field of view")
+    field(page, "fov").fill("60")
+    field(page, "baseline").fill("7.5 cm")
+    field(page, "baseline_error").fill("15 mm")
+    run(page)
+    idle(page)
+    add_point(page, 232, 192)
+    add_point(page, 232, 318)
+    words = page.locator("#readings").inner_text()
+    length, spread = map(float, re.search(rf"{NUMBER} ± {NUMBER} m", words).groups())
+    assert "± 20 % for the scale" in words and 0.2 * length <= spread < 0.5 * length
 
 
 def test_a_third_tap_starts_over_and_enlarged_images_are_tapped_more_precisely(visitor, plane_files):
@@ -313,6 +381,16 @@ def test_a_third_tap_starts_over_and_enlarged_images_are_tapped_more_precisely(v
     page.wait_for_timeout(300)
     *_, x, y = (int(number) for number in field(page, "ends").input_value().split(", "))
     assert abs(x - 64) <= 1 and abs(y - 48) <= 1
+    before, session = image.bounding_box(), page.context.new_cdp_session(page)
+    typed, y = field(page, "ends").input_value(), stage["y"] + 0.5 * stage["height"]
+    middle = stage["x"] + 0.5 * stage["width"]
+    touches(session, "touchStart", [(middle - 20, y), (middle + 20, y)])
+    for half in (24, 28, 32, 36, 40):
+        touches(session, "touchMove", [(middle - half, y), (middle + half, y)])
+    touches(session, "touchEnd", [])
+    page.wait_for_timeout(300)
+    assert image.bounding_box()["width"] == pytest.approx(2 * before["width"], rel=0.05), "a pinch"
+    assert field(page, "ends").input_value() == typed, "which marks nothing"
     page.locator("#known-image [name=full]").click()
     page.wait_for_selector("#known-image .zoom.filled")
     page.locator("#known-image [name=full]").click()
@@ -366,6 +444,71 @@ def test_the_3d_view_is_rotated_moved_and_zoomed_by_fingers_and_fills_the_screen
     assert page.locator(".viewer [name=size]").is_hidden(), "a mesh has no points"
     page.locator(".viewer [name=points]").check()
     assert page.locator(".viewer [name=size]").is_visible()
+
+
+#: Labels of the 3D view that cover a point, or none if it has no labels.
+COVERED = """() => {
+  const all = (kind) => [...document.querySelectorAll(`.viewer svg ${kind}`)]
+    .map((each) => each.getBoundingClientRect());
+  const texts = all("text");
+  return all("circle").map((box) => [(box.left + box.right) / 2, (box.top + box.bottom) / 2])
+    .map(([x, y]) => texts.filter((t) => t.left < x && x < t.right && t.top < y && y < t.bottom).length
+      + (texts.length ? 0 : 1));
+}"""
+#: Notes how many indices of triangles are drawn with blending, in frames that follow.
+NOTE_BLENDING = """() => {
+  const own = WebGL2RenderingContext.prototype.drawElements;
+  window.blended = [];
+  WebGL2RenderingContext.prototype.drawElements = function (mode, count, ...more) {
+    if (this.isEnabled(this.BLEND)) window.blended.push(count);
+    return own.call(this, mode, count, ...more);
+  };
+}"""
+
+
+def pixels_of(canvas) -> np.ndarray:
+    with Image.open(io.BytesIO(canvas.screenshot())) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def test_the_3d_view_has_uncovered_points_a_grid_cameras_in_the_frame_and_faded_holes(visitor):
+    page = visitor()
+    page.wait_for_selector(".viewer-count >> text=% of the pixels")
+    canvas = page.locator(".viewer canvas")
+    canvas.scroll_into_view_if_needed()
+    page.wait_for_timeout(1500)
+    for press in ("", "ArrowLeft", "ArrowUp", "ArrowUp"):
+        if press:
+            canvas.press(press)
+            page.wait_for_timeout(300)
+        assert page.evaluate(COVERED) == [0, 0]
+    page.locator(".viewer [name=reset]").click()
+    assert re.fullmatch(r"[\d.]+ c?m", page.locator(".viewer [name=grid-value]").inner_text())
+    page.evaluate("document.querySelector('.viewer svg').style.display = 'none'")
+    found = {}
+    for name in ("cameras", "grid"):
+        page.wait_for_timeout(400)
+        with_it = pixels_of(canvas)
+        page.locator(f".viewer [name={name}]").uncheck()
+        page.wait_for_timeout(400)
+        found[name] = np.abs(pixels_of(canvas) - with_it).max(-1) > 40
+    assert found["grid"].sum() > 200
+    rows, columns = np.nonzero(found["cameras"])
+    height, width = found["cameras"].shape
+    assert len(rows) > 50, "both cameras are drawn"
+    assert rows.min() > 2 and rows.max() < height - 3 and columns.min() > 2 and columns.max() < width - 3
+    page.evaluate(NOTE_BLENDING)
+    canvas.press("ArrowRight")
+    page.wait_for_function("() => window.blended.length && Math.min(...window.blended) > 100")
+
+
+def test_the_output_of_the_server_is_its_address(visitor, server):
+    page = visitor()
+    click_example(page, 3)
+    page.wait_for_selector("#status .verdict:not(.example) .figures", timeout=RUN_MS)
+    idle(page)
+    lines = server[1].read_text().splitlines()
+    assert len(lines) <= 1 and all(line.startswith("Serving on http") for line in lines)
 
 
 def test_the_divider_is_where_the_slider_is_and_a_click_on_the_depth_measures(visitor):

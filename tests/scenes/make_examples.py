@@ -14,7 +14,7 @@ __all__ = ["render_examples"]
 
 HEIGHT, WIDTH, RAYS_PER_SIDE = 336, 448, 3
 #: Kind of scene, seed (training starts at one million) and baseline in metres, by name.
-SCENES = {"table": ("tabletop", 21, 0.06), "street": ("street", 5, 0.5)}
+SCENES = {"street": ("street", 5, 0.5)}
 
 
 def render_examples(folder: Path = FOLDER) -> None:

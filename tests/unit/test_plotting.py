@@ -290,6 +290,10 @@ def test_titles_are_centred_above_images_and_rows_have_a_legend():
     legends = coloured[:, plain.shape[1] :]
     assert legends.shape[1] > 40 and not white(legends[:90]).all() and not white(legends[90:]).all()
     assert (legends[:90] != legends[90:180][: len(legends[:90])]).any(), "each row has its own range"
+    second = [None, (1, 10)]
+    coloured = np.asarray(grid(images, ["ab"] * 4, columns=2, cell_width=100, depth_ranges=second))
+    first, last = np.split(coloured[:, plain.shape[1] :], [90])
+    assert white(first).all() and not white(last).all(), "a row without depth has no bar"
 
 
 def test_cells_of_a_grid_keep_their_shape_and_stand_in_rows():

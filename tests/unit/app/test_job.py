@@ -77,8 +77,8 @@ def fov_of(fx: float, width: int = 64) -> float:
         ),
         (
             "images",
-            {"scale_input": "known", "known_length": 2.5, "ends": "-1, 2.5;30 y 4"},
-            {"estimate_pose": True, "known_length": "-1,2.5,30,4,2.5"},
+            {"scale_input": "known", "known_length": 2.5, "ends": "1, 2.5;30 y 4"},
+            {"estimate_pose": True, "known_length": "1,2.5,30,4,2.5"},
         ),
         (
             "images",
@@ -154,11 +154,54 @@ def test_the_scale_has_the_uncertainty_of_its_source(pair):
             {"scale_input": "known", "known_length": 2.0, "ends": "1 2 3 4 5"},
             "Mark both ends of the known length",
         ),
+        *(
+            (
+                "images",
+                {"scale_input": "known", "known_length": 2.0, "ends": ends},
+                rf"The end \({end}\) of the known length is outside of the image: x goes from 0 to 63",
+            )
+            for ends, end in (("9, 9, 64, 9", "64, 9"), ("3, -1, 9, 9", "3, -1"), ("3, 47.5, 9, 9", "3, 48"))
+        ),
+        *(("numbers", {"lens": LENS | {"fx": fx}}, "fx must be above 0.") for fx in (0.0, -3.0, math.inf)),
+        ("numbers", {"lens": LENS | {"fy": -1.0}}, "fy must be above 0."),
+        ("images", {"camera": "fx", "lens": {"fx": 0.0}}, "fx must be above 0."),
+        ("numbers", {"lens": LENS | {"cx": 900.0}}, "cx must be inside the image: between 0 and 64 pixels."),
+        ("numbers", {"lens": LENS | {"cy": -1.0}}, "cy must be inside the image: between 0 and 48 pixels."),
+        ("numbers", {"cx_right": 66.0}, "The right camera's cx must be inside the image: between 0 and 65"),
+        ("images", {"camera": "fx", "lens": LENS | {"cx": -0.1}}, "cx must be inside the image"),
+        ("file", {"baseline": -0.1}, "The distance between the cameras must be above 0."),
+        ("file", {"baseline": 0.0}, "The distance between the cameras must be above 0."),
     ],
 )
-def test_a_missing_field_is_named_with_what_to_do(way, more, message, pair):
+def test_a_missing_or_wrong_field_is_named_with_what_to_do(way, more, message, pair):
     with pytest.raises(PageError, match=message):
         request_of(*pair, CameraFields(way, **(FULL | more)))
+
+
+K_OF_LEFT = "50 0 32\n0 50 24\n0 0 1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("", "file.empty"),
+        (" \n\n", "file.empty"),
+        (K_OF_LEFT, "calibration.no-baseline"),
+        ("fx: 50\nfy: 50\ncx: 32\ncy: 24\n", "calibration.no-baseline"),
+        ("cam0=[50 0 32; 0 50 24; 0 0 1]\ncam1=[50 0 32; 0 50 24; 0 0 1]\n", "calibration.no-baseline"),
+        ("P0: 50 0 32 0 0 50 24 0 0 0 1 0\nP1: 50 0 32 0 0 50 24 0 0 0 1 0\n", "calibration.no-baseline"),
+        ('{"K1": [[50, 0, 32], [0, 50, 24], [0, 0, 1]], "K2": [[50, 0, 32], [0, 50, 24], [0, 0, 1]]}',
+         "calibration.no-baseline"),
+        ('{"K": [[50, 0, 32], [0, 50, 24], [0, 0, 1]]}', "calibration.one-camera"),
+        ("camera_matrix:\n  data: [50, 0, 32, 0, 50, 24, 0, 0, 1]\n", "calibration.one-camera"),
+    ],
+)  # fmt: skip
+def test_a_calibration_that_lacks_something_is_rejected_with_its_own_code(text, code, pair, tmp_path):
+    (tmp_path / "calib.txt").write_text(text)
+    request = request_of(*pair, CameraFields("file", (str(tmp_path / "calib.txt"),)))
+    with pytest.raises(InputError) as rejected:
+        run_job(request, Priors(("tiny",), torch.device("cpu")), threading.Event(), lambda *_: None)
+    assert rejected.value.code == code and request.camera_input == "file"
 
 
 @pytest.mark.parametrize(

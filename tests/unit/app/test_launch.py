@@ -2,11 +2,13 @@
 
 import asyncio
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -285,6 +287,13 @@ def test_a_port_that_is_taken_is_a_sentence_and_another_error_stays(monkeypatch)
 
 def raising(error):
     raise error
+
+
+def test_the_extra_has_every_package_that_the_page_needs():
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))
+    required = {re.match(r"[\w-]+", each)[0] for each in project["project"]["optional-dependencies"]["app"]}
+    needed = {"gradio", *(package.replace("_", "-") for package in launch.NEEDED_BY)}
+    assert {"poselib", "pillow-heif"} < needed <= required
 
 
 def test_without_gradio_it_states_what_to_install(monkeypatch):

@@ -7,6 +7,7 @@ import pytest
 
 import geodiff_plugin
 from geodiff_plugin._internal.checks import InputError, UnknownFormatError, bad_value, raise_input_error
+from geodiff_plugin.app.job import CAMERA_INPUTS
 from geodiff_plugin.app.messages import (
     ERRORS_ON_PAGE,
     FINDINGS_ON_PAGE,
@@ -71,5 +72,9 @@ def test_an_error_has_the_sentence_of_its_code():
     assert error(raise_input_error, "x", code="memory").code == "memory"
     other = error_on_page(error(bad_value, "K", "x", "y"))
     assert "cannot be used together" in other.text and other.detail == "K must be x; got y."
+    assert other.hint == ""
+    hints = {way: error_on_page(error(bad_value, "K", "x", "y"), (), way).hint for way in CAMERA_INPUTS}
+    assert len(set(hints.values())) == 3
+    assert {way for way, hint in hints.items() if "calibration" in hint} == {"file"}
     assert error_on_page(PageError("As it is.")) == Message("As it is.")
     assert error_on_page(UnknownFormatError("of /x")).detail == ""

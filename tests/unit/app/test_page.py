@@ -29,6 +29,7 @@ from geodiff_plugin.app.sessions import Result, Stopped
 from geodiff_plugin.app.shown import clean_report, load, save, shown_of, visible_in_viewer
 from geodiff_plugin.formats import read_calibration, read_image
 from geodiff_plugin.jobs import DepthOptions
+from tests.images.rooms import room_named
 from tests.unit.app.made_result import made_result
 
 gr = pytest.importorskip("gradio", reason="gradio is in the extra app")
@@ -162,7 +163,8 @@ def is_drawn(values: dict, result: Result, paths=None) -> bool:
     if paths is not None:
         assert values["files"] == templates.files(paths, results.PURPOSES)
     assert values["marks_data"] == templates.hidden(found.marks())
-    assert values["headline"] == found.headline() and values["readings"] == found.html()
+    assert values["headline"] == values["depth_headline"] == found.headline()
+    assert values["readings"] == found.html()
     return True
 
 
@@ -179,6 +181,10 @@ def test_the_page_opens_with_a_finished_result(page, desk):
     assert 0.1 < segment.length_m < 1 and 0 < segment.spread_m < segment.length_m / 3
     assert segment.text in found.headline() and "use your own pair" in found.headline()
     assert visible_in_viewer(first.shown).mean() > 0.5
+
+
+def test_the_first_measurement_is_the_one_of_the_animation_in_the_readme(page):
+    assert page.module.read_first_result().pixels == list(room_named("toy").clicks)
 
 
 def test_components_have_the_ids_that_styles_and_scripts_use(page, desk):
@@ -239,7 +245,7 @@ def test_fonts_and_colours_of_the_page_are_those_of_the_system_and_of_its_style_
 def test_clicks_call_what_they_should_with_their_fields(page, desk):
     form, panels, secret = desk.form, desk.panels, desk.secret
     fields, outputs = list(form.fields.values()), desk.of_result()
-    assert [type(output).__name__ for output in outputs] == ["HTML"] * 9 + ["File", "Textbox"]
+    assert [type(output).__name__ for output in outputs] == ["HTML"] * 10 + ["File", "Textbox"]
 
     def check(f, events, inputs, to, **more):
         if events is not None:
@@ -266,7 +272,7 @@ def test_clicks_call_what_they_should_with_their_fields(page, desk):
     check(page.of("note_uploads")[0], [(field, "upload") for field in drops], drops, [], **quick)
     (changed,) = [f for f in page.fns if f.js == templates.CHANGED]
     check(changed, [(field, event) for field in drops for event in ("upload", "clear")], [], [], queue=False)
-    measured = [panels.marks_data, panels.headline, panels.readings]
+    measured = [panels.marks_data, panels.headline, panels.depth_headline, panels.readings, panels.status]
     in_order = quick | {"queue": True, "trigger_mode": "multiple", "concurrency_limit": 1}
     in_order |= {"concurrency_id": "points"}
     picked, typed = page.of("add_point")
@@ -370,7 +376,9 @@ def test_an_expired_result_is_gone_everywhere(desk, jobs):
     screen = Screen(desk)
     run(desk, jobs, made_result(), screen)
     desk.sessions.store.drop(screen.shows["secret"])
-    assert templates.EXPIRED in screen.click(5, 7)["readings"]
+    changes = screen.click(5, 7)
+    assert all(templates.EXPIRED in changes[name] for name in ("readings", "headline", "depth_headline"))
+    assert changes["status"].startswith('<div class="box box-error" role="alert"><b>No new result.</b> This')
     run(desk, jobs, coded("memory"), screen)
     empty = ("scene_data", "marks_data", "depth", "legend", "confidence")
     assert all(screen.shows[name] == "" for name in empty) and screen.shows["files"] == templates.WAITING

@@ -7,7 +7,7 @@ import re
 import zlib
 from base64 import b64decode
 from dataclasses import replace
-from zipfile import ZIP_STORED, ZipFile
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import matplotlib
 import numpy as np
@@ -82,6 +82,21 @@ def test_a_pixel_without_depth_is_explained(depth):
     shown.depth_m[9, 7] = depth
     with pytest.raises(PageError, match=r"\(7, 9\) has no depth"):
         results.check_pixel(shown, (7, 9))
+
+
+def test_a_pixel_beyond_the_measurable_range_is_explained_by_that_range():
+    shown = made_result()
+    beyond = shown.depth_m > 2.5
+    shown = replace(shown, depth_m=np.where(beyond, 0, shown.depth_m), beyond=beyond, measurable_m=71.37)
+    y, x = np.argwhere(beyond)[3]
+    with pytest.raises(PageError, match=rf"\({x}, {y}\) is too far to be measured: .* up to 71 m\. Choose"):
+        results.check_pixel(shown, (x, y))
+    results.check_pixel(shown, (0, 0))
+    image, plain = results.map_image(shown, "depth"), colour_depth(shown.depth_m)
+    hatched = (image != plain).any(-1)
+    assert hatched.any() and not (hatched & ~beyond).any()
+    ends = [float(text) for text in re.findall(r">([\d.]+) m<", results.legend_of_depth(shown.depth_m))]
+    assert max(ends) <= 2.5 < made_result().depth_m.max()
 
 
 def test_names_of_points_go_on_after_z():
@@ -268,7 +283,8 @@ def test_files_are_listed_in_order_and_measurements_are_numbers_of_the_readings(
     assert [path.name for path in paths] == table
     with ZipFile(paths[0]) as archive:
         assert archive.namelist() == [name for name in table[1:] if not name.endswith(".npy")]
-        assert all(entry.compress_type == ZIP_STORED for entry in archive.infolist())
+        packed = {entry.filename for entry in archive.infolist() if entry.compress_type == ZIP_DEFLATED}
+        assert packed == {name for name in table if name.endswith((".glb", ".ply"))} != set()
         assert archive.read("a.txt") == b"a.txt"
         rows = rows_of(archive.read("measurements.csv").decode())
     found = readings(shown)

@@ -143,6 +143,19 @@ def test_the_latest_run_of_a_tab_wins_and_the_others_are_stopped(timers, tmp_pat
     assert tab.end(fourth)
 
 
+def test_a_result_that_a_duplicated_tab_shows_survives_a_run_of_the_other_tab(timers, tmp_path):
+    tabs = all_sessions()
+    one, two = tabs.of("one"), tabs.of("two")
+    kept = shown(tmp_path / "kept")
+    tabs.show(one, one.begin(), kept, [(7, 8)])
+    two.secret = one.secret  # the browser copies a tab with its storage
+    tabs.show(one, one.begin(), shown(), [])
+    assert tabs.result(two).shown is kept and (tmp_path / "kept").exists()
+    assert tabs.result(one).shown is not kept
+    tabs.show(two, two.begin(), shown(), [])
+    assert not (tmp_path / "kept").exists(), "no tab shows it"
+
+
 def test_a_tab_that_leaves_ends_its_run_and_its_result_soon_unless_another_one_has_it(timers, tmp_path):
     sessions = all_sessions()
     secrets = [sessions.store.add(Result(shown())) for _ in range(2)]

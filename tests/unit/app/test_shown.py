@@ -83,8 +83,9 @@ def test_a_shown_result_has_every_map_and_camera_of_the_job(done, tmp_path):
     shown, made = done(), made_result()
     np.testing.assert_array_equal(shown.image, made.image)
     expected = made.depth_m.copy()
-    expected[5, 9] = 77
+    expected[:, :4] = expected[5, 9] = 0  # not valid
     np.testing.assert_array_equal(shown.depth_m, expected)
+    assert not shown.beyond.any() and shown.measurable_m is None
     np.testing.assert_array_equal(shown.confidence, made.confidence)
     np.testing.assert_array_equal(shown.sigma_m, made.sigma_m)
     left, right = shown.views
@@ -100,6 +101,17 @@ def test_a_shown_result_has_every_map_and_camera_of_the_job(done, tmp_path):
     bare = done(confidence=None, sigma=None, visible=None)
     assert bare.confidence is None and bare.sigma_m is None
     assert [figure.name for figure in bare.figures] == ["depth range", "median depth", "compute time"]
+
+
+def test_depth_beyond_the_measurable_range_is_no_depth(done):
+    shown = done(measurable_m=np.array([2.6]))
+    valid = np.ones((H, W), bool)
+    valid[:, :4] = valid[5, 9] = False
+    beyond = made_result().depth_m > 2.6
+    beyond[5, 9] = True
+    assert shown.measurable_m == 2.6 and 0.1 < beyond.mean() < 0.9
+    np.testing.assert_array_equal(shown.beyond, beyond)
+    np.testing.assert_array_equal(shown.depth_m > 0, valid & ~beyond)
 
 
 def test_findings_are_shown_once_and_not_again_if_the_summary_has_them(done):

@@ -352,10 +352,13 @@ def finished(tmp_path) -> Capture:
     return capture
 
 
+DRAW_DEPTH = plotting.depth_figure
+
+
 @pytest.fixture
 def plain_figures(monkeypatch):
     """Figures of depth take most of the time of a run. Other tests look at them."""
-    monkeypatch.setattr(plotting, "depth_figure", lambda depth, **_: Image.new("RGB", (8, 6)))
+    monkeypatch.setattr(plotting, "depth_figure", lambda depth, *_, **__: Image.new("RGB", (8, 6)))
 
 
 def alone(out, number: int) -> DepthFrame:
@@ -695,8 +698,9 @@ def test_the_sheet_has_every_frame_and_its_depth_and_marks_those_that_are_not_tr
 def test_the_video_shows_images_next_to_depth_in_the_colours_of_one_range(
     finished, plain_figures, tmp_path, monkeypatch
 ):
-    """All frames have one size, whatever the size of their images."""
+    """All frames have one size, whatever the size of their images, and a bar in metres."""
     videos = []
+    monkeypatch.setattr(plotting, "depth_figure", DRAW_DEPTH)
     monkeypatch.setattr(
         plotting, "write_depth_video", lambda path, frames, fps: videos.append((path, list(frames), fps))
     )
@@ -707,17 +711,15 @@ def test_the_video_shows_images_next_to_depth_in_the_colours_of_one_range(
     near, far = np.percentile(np.concatenate([depth[::8, ::8].ravel() for depth in maps]), (2, 98))
     for number, frame in enumerate(frames):
         assert frame.size == (1280, 480)
+        drawn = DRAW_DEPTH(maps[number], near, far, unit=finished.unit)
         width, height = SIZES[number]
-        scale = min(1280 / (2 * width), 480 / height)
-        pair = [
-            np.rint(255 * image_of(number)).astype(np.uint8),
-            plotting.colour_depth(maps[number], near, far),
-        ]
-        shown = np.asarray(
-            Image.fromarray(np.hstack(pair)).resize(
-                (round(2 * width * scale), round(height * scale)), Image.BICUBIC
-            )
-        )
+        photo = Image.fromarray(np.rint(255 * image_of(number)).astype(np.uint8))
+        photo = photo.resize((round(width * drawn.height / height), drawn.height))
+        pair = np.hstack([photo, drawn])
+        assert pair.shape[1] > 2 * photo.width, "with a bar"
+        scale = min(1280 / pair.shape[1], 480 / pair.shape[0])
+        size = round(pair.shape[1] * scale), round(pair.shape[0] * scale)
+        shown = np.asarray(Image.fromarray(pair).resize(size, Image.BICUBIC))
         left, top = (1280 - shown.shape[1]) // 2, (480 - shown.shape[0]) // 2
         inside = np.asarray(frame)[top : top + shown.shape[0], left : left + shown.shape[1]]
         assert np.abs(inside.astype(int) - shown).mean() < 4

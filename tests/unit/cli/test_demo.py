@@ -45,7 +45,8 @@ def made(monkeypatch, pair):
     def depth_pair(options, pipe, *, folder, notify, progress):
         asked.pairs.append((options, pipe, folder, notify, progress))
         left = np.full((4, 5, 3), len(asked.pairs) / 10, np.float32)
-        output = SimpleNamespace(prediction=one(ground_truth * 1.04))
+        depth_m = one(ground_truth * 1.04)
+        output = SimpleNamespace(prediction=depth_m, valid=depth_m > 0, measurable_m=asked.measurable_m)
         run = SimpleNamespace(output=output, inputs=SimpleNamespace(left=left))
         return SimpleNamespace(report=REPORT, run=run)
 
@@ -57,7 +58,7 @@ def made(monkeypatch, pair):
     monkeypatch.setattr(demo, "prior_of_options", prior_of_options)
     monkeypatch.setattr(demo, "depth_pair", depth_pair)
     monkeypatch.setattr(demo, "grid", grid)
-    asked.ground_truth = ground_truth
+    asked.ground_truth, asked.measurable_m = ground_truth, None
     return asked
 
 
@@ -128,6 +129,9 @@ def test_real_pairs_have_a_folder_each_and_one_sheet(made, tmp_path, capsys, mon
     np.testing.assert_allclose(images[0], 0.1)
     np.testing.assert_allclose(images[2], 0.2)
     np.testing.assert_array_equal(images[1], demo.colour_depth(made.ground_truth * 1.04))
+    made.measurable_m = np.array([2.0])
+    demo.run_real_demo(pairs, tmp_path)
+    assert all(near < far <= 2.0 for near, far in made.ranges), "what is too far does not set the colours"
     said = capsys.readouterr().out
     assert f"{taken[0]}/" in said and str(tmp_path / "comparison.png") in said
 

@@ -124,7 +124,7 @@ def test_a_sample_is_shown_with_depth_ground_truth_errors_and_clouds_on_one_scal
     monkeypatch.setattr(figures, "colour_fraction", lambda e, most: errors.append((e, most)) or "error")
     monkeypatch.setattr(figures, "render_cloud", lambda m, *more: views.append((m, *more)) or "cloud")
     answers = [figures._answer(sample, name, Settings(), None) for name in ("half", "twice")]
-    rgb_images, titles = figures._rows(sample, answers, clouds)
+    rgb_images, titles, ranges = figures._rows(sample, answers, clouds)
     ground_truth = np.where(sample.valid, sample.depth_m, np.nan)
     assert rgb_images[0] is sample.left
     assert rgb_images[1:] == ["depth"] * 3 + ["error"] * 2 + ["cloud"] * 3 * clouds
@@ -142,6 +142,7 @@ def test_a_sample_is_shown_with_depth_ground_truth_errors_and_clouds_on_one_scal
     for (error, most), wanted in zip(errors, (0.5, 1.0), strict=True):
         np.testing.assert_allclose(error[sample.valid], wanted, rtol=1e-6)
         assert np.isnan(error[~sample.valid]).all() and most == 0.5
+    assert ranges == [depths[0][1:], None, *[None] * clouds], "the row of depths has a bar in metres"
     assert titles[:4] == ["s", "Half, AbsRel 0.500", "Twice, AbsRel 1.000", titles[3]]
     assert titles[3] == f"ground truth, {depths[0][1]:.3g} m to {depths[0][2]:.3g} m"
     assert (
@@ -174,13 +175,16 @@ def test_side_by_side_draws_every_sample_with_every_method(sample, methods, monk
     given = FigureOptions(name="qualitative", out=tmp_path)
     drawing = figures.draw_side_by_side(("half", "never", "twice"), given)
     cells, titles, more = gridded[0]
+    ranges = more.pop("depth_ranges")
+    assert [each is None for each in ranges] == [False, True] * 2
     assert more == {"columns": 4} and len(cells) == len(titles) == 2 * 8 and drawing.rgb == "grid"
     half, never, twice = pytest.approx(0.5), None, pytest.approx(1.0)
     expected = {f"d/{r}": {"half": half, "never": never, "twice": twice} for r in ("r1", "r2")}
     assert drawing.numbers == {"abs_rel": expected} and titles[0] == "r1" and titles[8] == "r2"
     asked = FigureOptions(name="qualitative", out=tmp_path, methods=("twice",), clouds=True)
     assert list(figures.draw_side_by_side(("half",), asked).numbers["abs_rel"]["d/r1"]) == ["twice"]
-    assert gridded[1][2] == {"columns": 2} and len(gridded[1][0]) == 2 * (1 + 2 + 1 + 2)
+    assert gridded[1][2]["columns"] == 2 and len(gridded[1][2]["depth_ranges"]) == 2 * 3
+    assert len(gridded[1][0]) == 2 * (1 + 2 + 1 + 2)
 
 
 def test_a_risk_coverage_figure_draws_the_mean_curve_of_each_method_and_the_best_order(monkeypatch, tmp_path):

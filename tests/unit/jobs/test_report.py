@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from geodiff_plugin.jobs.report import (
     build_report,
     depth_range_words,
     depth_summary,
+    measurable_limit,
+    measured_depth,
     plain,
     read_report,
     report_text,
@@ -76,6 +79,19 @@ def test_depth_that_cannot_be_measured_is_no_maximum():
     assert depth_range_words(near, "m") == "3.00 m to 60.00 m"
     far = depth_summary(depth_m[:, 2:], None, valid[:, 2:], 156.0)
     assert depth_range_words(far, "m") == depth_range_words(plain(far), "m") == "beyond 160 m"
+
+
+def test_measured_depth_is_0_where_it_is_invalid_or_too_far():
+    depth_m = np.array([[3.0, 60.0, 400.0, 593.0, 7.0, np.nan]], np.float32)
+    valid = np.array([[True, True, True, False, False, False]])
+    for limit, expected in ((71.2, [3, 60, 0, 0, 0, 0]), (None, [3, 60, 400, 0, 0, 0])):
+        measurable = None if limit is None else np.array([limit])
+        output = SimpleNamespace(
+            prediction=depth_m[None, ..., None], valid=valid[None, ..., None], measurable_m=measurable
+        )
+        found = measured_depth(output)
+        assert found.dtype == np.float32 and measurable_limit(output) == limit
+        np.testing.assert_array_equal(found, [expected])
 
 
 def test_errors_are_those_of_pixels_that_a_right_view_sees(run, report):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from geodiff_plugin import plotting
@@ -110,9 +111,20 @@ def test_maps_and_counts_are_those_of_the_output(run, tmp_path, plain_figures):
     drawn, label, top, named = plain_figures["fraction_figure"]
     np.testing.assert_array_equal(drawn, confidence)
     assert (label, top, named) == ("confidence", 1.0, {})
-    drawn, named = plain_figures["depth_figure"]
+    drawn, *ends, named = plain_figures["depth_figure"]
     np.testing.assert_array_equal(drawn, depth_m)
-    assert named == {"unit": "m"}
+    assert named == {"unit": "m"} and tuple(ends) == plotting.depth_range(np.where(valid, depth_m, 0))
+
+
+def test_colours_end_at_the_farthest_measured_depth(run):
+    depth_m = run.output.prediction
+    median_m = float(np.median(depth_m[depth_m > 0]))
+    assert writing.figure_range(run.output)[1] > median_m
+    output = replace(run.output, measurable_m=torch.tensor([median_m]))
+    near, far = writing.figure_range(output)
+    assert near < far <= median_m
+    beyond = replace(run.output, measurable_m=torch.tensor([0.01]))
+    assert writing.figure_range(beyond) == plotting.depth_range(one_map(depth_m)), "nothing was measured"
 
 
 def test_the_cloud_holds_the_points_that_are_kept_with_their_colours(run, tmp_path):
@@ -155,7 +167,7 @@ def test_an_output_without_a_second_view_writes_what_it_has(tmp_path, plain_figu
     assert reported["doubtful_points"] == 0 and reported["points_out_of_reach"] == (depth_m == 0).sum()
     assert reported["cloud_points"] == ((depth_m > 0) & ~flying(depth_m)).sum()
     assert plain_figures["overview"][2:4] == (None, None)
-    assert plain_figures["depth_figure"][1] == {"unit": None}
+    assert plain_figures["depth_figure"][-1] == {"unit": None}
     assert b"metre" not in (tmp_path / "cloud.ply").read_bytes()[:400]
 
 
