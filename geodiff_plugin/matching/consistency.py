@@ -99,12 +99,15 @@ def window_mean(maps: Tensor, radius: int) -> Tensor:
             padding = (window[0] // 2, window[1] // 2)
             maps = F.avg_pool2d(maps, window, 1, padding, count_include_pad=False)
         return maps
-    for axis, padding in ((-2, (0, 0, radius, radius)), (-1, (radius, radius))):
-        size = maps.shape[axis]
-        at = torch.arange(size, dtype=maps.dtype)
-        count = (at + radius).clamp_max(size - 1) - (at - radius).clamp_min(0) + 1.0
-        maps = _sums(F.pad(maps, padding), length, axis) / (count[:, None] if axis == -2 else count)
-    return maps
+    sums = _sums(_sums(F.pad(maps, (radius,) * 4), length, -2), length, -1)
+    rows, columns = (_in_window(size, radius).to(maps) for size in maps.shape[-2:])
+    return sums / (rows[:, None] * columns)
+
+
+def _in_window(size: int, radius: int) -> Tensor:
+    """Count the positions of an axis within ``radius`` of each one, ``(size,)``."""
+    at = torch.arange(size)
+    return (at + radius).clamp_max(size - 1) - (at - radius).clamp_min(0) + 1
 
 
 def _sums(values: Tensor, length: int, axis: int) -> Tensor:

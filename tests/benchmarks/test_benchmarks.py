@@ -11,7 +11,7 @@ import torch
 from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from tests.benchmarks import calls, cost, gpu, large, live, many, maps, operations
+from tests.benchmarks import calls, cost, gpu, import_time, large, live, many, maps, operations
 from tests.benchmarks.full_sizes import UNET, VAE
 from tests.benchmarks.matrix import deviation
 from tests.benchmarks.random_marigold import narrowed
@@ -52,6 +52,15 @@ def test_exponent_of_a_power():
     values = (10, 20, 40)
     assert cost.exponent(values, [3.0 * v**1.5 for v in values]) == pytest.approx(1.5)
     assert cost.exponent(values, [7.0] * 3) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_stages_of_a_command_add_up():
+    rows = import_time.stage_rows({"python": 1.0, "torch": 3.0, "work": 4.0})
+    assert rows == [
+        ("python", "1.00", "1.00", "25"),
+        ("torch", "3.00", "2.00", "50"),
+        ("work", "4.00", "1.00", "25"),
+    ]
 
 
 def test_resized_images_keep_their_centre():

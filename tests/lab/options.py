@@ -49,6 +49,7 @@ class MapError(NamedTuple):
 
 MAP_ERRORS = {
     "far": MapError(far=0.9),
+    "smooth1": MapError(smooth=0.01),
     "smooth5": MapError(smooth=0.05),
     "smooth10": MapError(smooth=0.1),
     "smooth15": MapError(smooth=0.15),

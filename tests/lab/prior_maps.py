@@ -35,8 +35,8 @@ PATCHED = 0.3
 
 NOTE = (
     "AbsRel in metres. far: ground truth with depth beyond the median times 0.9; smooth: times a smooth "
-    "field of 5, 10 or 15 %; patches: 30 % of the image in squares of a tenth of its longer side, each times "
-    "a lognormal factor (0.4). Ratio: the result over the better of map and default."
+    "field of 1, 5, 10 or 15 %; patches: 30 % of the image in squares of a tenth of its longer side, each "
+    "times a lognormal factor (0.4). Ratio: the result over the better of map and default."
 )
 
 Predict = Callable[[StereoSample, Settings, PriorCache], Prediction]

@@ -1,6 +1,10 @@
 """Depth maps with errors as priors: the command, and the bound on real and rendered pairs."""
 
+import os
+from functools import cache
+from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -14,6 +18,27 @@ from tests.lab.prior_maps import map_with_error, prior_maps_tables, ratios
 pytestmark = pytest.mark.end_to_end
 
 SMALL = "synthetic:1+4@128x96"
+REAL = (
+    *("kitti2012/000013", "kitti2012/000084", "kitti2015/000000"),
+    *("middlebury2014/Adirondack-perfect", "eth3d/terrace_2s"),
+)
+RENDERED = tuple(f"synthetic/seed{seed:04}" for seed in range(4))
+#: Names the folder of PSMNet's maps, which ``examples.learned_stereo --maps-only`` writes.
+MAPS_VARIABLE = "GEODIFF_PSMNET_MAPS"
+UNSEEN = "the images cannot reveal the error of the map"
+BETTER = "the map is better than the matches"
+#: Rows of docs/reference/results.md above 1.05, and the reasons it states.
+WORSE = {
+    ("kitti2015/000000", "smooth1"): BETTER,
+    ("kitti2015/000000", "PSMNet"): BETTER,
+    ("middlebury2014/Adirondack-perfect", "PSMNet"): UNSEEN,
+    ("synthetic/seed0002", "smooth1"): BETTER,
+    ("synthetic/seed0002", "smooth10"): UNSEEN,
+    ("synthetic/seed0002", "smooth15"): UNSEEN,
+    ("synthetic/seed0002", "patches"): UNSEEN,
+    ("synthetic/seed0003", "smooth1"): BETTER,
+    ("synthetic/seed0003", "smooth5"): UNSEEN,
+}
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +85,35 @@ def test_the_command_writes_a_page(tmp_path):
     assert {row[1] for row in table.rows} == {"far", "patches"}  # the folder has no map of this pair
 
 
+@cache
+def ratios_of(pair: str) -> dict[str, float]:
+    """Ratio by map of a pair, rounded as in the table of docs/reference/results.md."""
+    folder_of_maps = os.environ.get(MAPS_VARIABLE)
+    maps = (f"disparity:{folder_of_maps}",) if pair in REAL and folder_of_maps else ()
+    data = DATA if pair in REAL else Path(f"synthetic:{len(RENDERED)}")
+    with TemporaryDirectory() as folder:
+        options = PriorMapsOptions(data=(data,), scenes=(pair,), maps=maps, out=Path(folder), quiet=True)
+        (table,) = prior_maps.run("prior-maps", options).tables
+    names = dict.fromkeys(maps, "PSMNet")
+    return {names.get(row[1], row[1]): float(row[-1]) for row in table.rows}
+
+
+def rows():
+    """Rows of the documented table; those above 1.05 must fail, so that an improvement shows as well."""
+    for pair, error in product((*REAL, *RENDERED), (*MAP_ERRORS, "PSMNet")):
+        if error == "PSMNet" and pair in RENDERED:
+            continue
+        marks = []
+        if reason := WORSE.get((pair, error)):
+            marks.append(pytest.mark.xfail(raises=AssertionError, strict=True, reason=reason))
+        if pair in REAL:
+            marks.append(pytest.mark.skipif(not DATA.is_dir(), reason="no real samples"))
+        if error == "PSMNet":
+            marks.append(pytest.mark.skipif(MAPS_VARIABLE not in os.environ, reason="no maps of PSMNet"))
+        yield pytest.param(pair, error, marks=marks)
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(not DATA.is_dir(), reason="no real samples")
-def test_results_are_within_5_percent_of_the_better_of_map_and_default(tmp_path):
-    """Real pairs and a rendered one; docs/reference/results.md names the pairs on which this fails."""
-    scenes = ("kitti2012/000084", "Adirondack", "terrace", "seed")
-    options = PriorMapsOptions(data=(DATA, Path("synthetic:1+1")), scenes=scenes, out=tmp_path, quiet=True)
-    (table,) = prior_maps.run("prior-maps", options).tables
-    assert len(table.rows) == 4 * len(MAP_ERRORS)
-    assert float(table.rows[-1][-1]) <= 1.05, table.rows[-1]
+@pytest.mark.parametrize(("pair", "error"), list(rows()))
+def test_the_result_is_within_5_percent_of_the_better_of_map_and_default(pair, error):
+    assert ratios_of(pair)[error] <= 1.05

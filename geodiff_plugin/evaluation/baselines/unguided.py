@@ -58,12 +58,12 @@ WLS_LAMBDA = 8000.0
 WLS_SIGMA = 1.5
 
 
-def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
+def sgbm_shift(sample: StereoSample, wls: bool = False, mode: int = cv2.STEREO_SGBM_MODE_HH) -> np.ndarray:
     """Return ``f b / z`` in pixels, ``(H, W)`` float32 (disparity plus doffs); NaN if rejected."""
     # Depth at infinity has the disparity cx_left - cx_right, which is nonzero only for Middlebury's doffs.
     lowest = int(np.floor(sample.K_left[0, 2] - sample.K_right[0, 2]))
     count = 16 * int(np.ceil(MAX_SHIFT * sample.left.shape[1] / 16))
-    matcher = make_matcher(lowest, count, 3, cv2.STEREO_SGBM_MODE_HH)
+    matcher = make_matcher(lowest, count, 3, mode)
     pad = max(0, lowest + count)
     left, right = pad_columns(sample.left, pad), pad_columns(sample.right, pad)
     raw = matcher.compute(left, right)
@@ -80,14 +80,20 @@ def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
     return shift
 
 
-def _run_sgbm(wls: bool, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
+def _run_sgbm(
+    sample: StereoSample,
+    settings: Settings,
+    priors: PriorCache,
+    wls: bool = False,
+    mode: int = cv2.STEREO_SGBM_MODE_HH,
+) -> Prediction:
     if not sample.rectified:
         raise NotApplicable("not rectified")
     if sample.left.shape != sample.right.shape:
         raise NotApplicable("views of different sizes")
     if wls and not hasattr(cv2, "ximgproc"):
         raise NotApplicable("cv2.ximgproc, of opencv-contrib-python, is not installed")
-    with_holes = sgbm_shift(sample, wls)
+    with_holes = sgbm_shift(sample, wls, mode)
     depth_m = sample.K_left[0, 0] * sample.E[0, 3] / fill_background(with_holes)
     return Prediction(depth_m, space="disparity", notes={"density": float(np.isfinite(with_holes).mean())})
 
@@ -109,11 +115,22 @@ _SHIFTS: dict[str, Any] = {"max_shift": MAX_SHIFT, "min_shift_px": MIN_SHIFT_PX,
 _SHIFTS |= {"fill": "background"} | PARAMETERS
 _CHOICES = {"cost": "census", "aggregation": "semi-global", "fill": "background"}
 _SGBM = "OpenCV StereoSGBM (8-way) with background fill; rectified pairs only"
-_WLS = "the same smoothed by OpenCV's WLS filter; needs opencv-contrib-python"
+_THREE_WAY = "sgbm in the faster three-way mode, which guided calls run on rectified pairs"
+_WLS = "sgbm smoothed by OpenCV's WLS filter; needs opencv-contrib-python"
 _SWEEP = "this package's plane sweep, aggregated, left-right checked and filled, any pose"
 STEREO_METHODS = (
-    Method("sgbm", "SGBM + fill", _SGBM, partial(_run_sgbm, False), lambda _: _SHIFTS, uses_prior=False),
-    Method("sgbm-wls", "SGBM + WLS", _WLS, partial(_run_sgbm, True), lambda _: _SHIFTS, uses_prior=False),
+    Method("sgbm", "SGBM + fill", _SGBM, _run_sgbm, lambda _: _SHIFTS, uses_prior=False),
+    Method(
+        *("sgbm-wls", "SGBM + WLS", _WLS, partial(_run_sgbm, wls=True)),
+        lambda _: _SHIFTS,
+        uses_prior=False,
+    ),
+    Method(
+        *("sgbm-3way", "SGBM (3-way) + fill", _THREE_WAY),
+        partial(_run_sgbm, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY),
+        lambda _: _SHIFTS | {"mode": "3way"},
+        uses_prior=False,
+    ),
     Method(
         *("sweep-sgm", "sweep + SGM", _SWEEP, _run_sweep),
         lambda settings: _CHOICES | {"views": settings.views, "device": settings.device},

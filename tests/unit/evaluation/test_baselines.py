@@ -497,6 +497,9 @@ def priors(make_pipeline):
     return OnePipe(make_pipeline())
 
 
+SGBM = ("sgbm", "sgbm-wls", "sgbm-3way")
+
+
 @END_TO_END
 @pytest.mark.parametrize("name", METHODS)
 def test_method_handles_a_rectified_pair_and_a_posed_one_or_states_why_not(name, priors, textured_plane):
@@ -506,7 +509,7 @@ def test_method_handles_a_rectified_pair_and_a_posed_one_or_states_why_not(name,
         if name == "sgbm-wls" and sample.rectified and not hasattr(cv2, "ximgproc"):
             with pytest.raises(NotApplicable, match="opencv-contrib-python"):
                 METHODS[name].run(sample, Settings(), priors)
-        elif name in ("sgbm", "sgbm-wls") and not sample.rectified:
+        elif name in SGBM and not sample.rectified:
             with pytest.raises(NotApplicable, match="not rectified"):
                 METHODS[name].run(sample, Settings(), priors)
         else:
@@ -524,7 +527,7 @@ def test_configuration_is_json_and_names_what_matters(name):
     assert method.name == name and method.summary
     settings = Settings(), Settings(seed=1), Settings(device="cuda")
     plain, other, on_cuda = (json.dumps(method.configuration(s), sort_keys=True) for s in settings)
-    assert (plain != other) == method.uses_prior and (on_cuda == plain) == (name in ("sgbm", "sgbm-wls"))
+    assert (plain != other) == method.uses_prior and (on_cuda == plain) == (name in SGBM)
     assert "bundled" not in plain  # the prior has its own place in the key
 
 
@@ -660,4 +663,13 @@ def test_sgbm_recovers_a_known_shift(tmp_path, doffs):
     sample = replace(wall, K_right=wall.K_right + np.array([[0, 0, doffs], [0, 0, 0], [0, 0, 0]]))
     shift = sgbm_shift(sample)
     assert np.isfinite(shift).mean() > 0.8 and np.nanmedian(shift) == pytest.approx(8 + doffs, abs=1 / 16)
-    assert np.median(run("sgbm", sample).depth_m) == pytest.approx(10 / (8 + doffs), rel=0.02)
+    for name in ("sgbm", "sgbm-3way"):
+        assert np.median(run(name, sample).depth_m) == pytest.approx(10 / (8 + doffs), rel=0.02)
+
+
+@END_TO_END
+def test_the_modes_of_sgbm_differ_in_result_and_key(textured_plane):
+    sample = plane_sample(textured_plane)
+    assert not np.array_equal(run("sgbm", sample).depth_m, run("sgbm-3way", sample).depth_m)
+    keys = [json.dumps(find_method(name).configuration(Settings())) for name in ("sgbm", "sgbm-3way")]
+    assert keys[0] != keys[1]
