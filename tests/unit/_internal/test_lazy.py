@@ -3,6 +3,7 @@
 import atexit
 import gc
 import importlib
+import subprocess
 import sys
 import types
 from types import SimpleNamespace
@@ -73,6 +74,16 @@ def collector(monkeypatch):
     monkeypatch.setattr(gc, "isenabled", lambda: on[0])
     monkeypatch.setattr(_lazy, "_frozen", False)
     return asked
+
+
+def test_the_first_use_in_a_process_freezes_its_objects():
+    """In another process, because tests may have frozen this one."""
+    code = (
+        "import gc; from geodiff_plugin._internal.lazy import gc_frozen\n"
+        "with gc_frozen(): assert not gc.isenabled()\n"
+        "assert gc.isenabled() and gc.get_freeze_count() > 0"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_first_imports_are_left_out_by_the_collector_and_later_ones_are_not(collector):
