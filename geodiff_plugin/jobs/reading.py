@@ -36,7 +36,7 @@ from geodiff_plugin.jobs.cameras import (
     settled_packing,
 )
 from geodiff_plugin.jobs.known import KnownGeometry, read_known
-from geodiff_plugin.jobs.masks import find_overlays, read_masks
+from geodiff_plugin.jobs.masks import find_overlays, read_masks, undistorted_masks
 from geodiff_plugin.jobs.options import AUTO, DepthOptions, unique_names
 from geodiff_plugin.jobs.pairs import PairRef, file_digests
 from geodiff_plugin.jobs.records import JobLog, PairInputs, PairOrigin, ReadPair
@@ -76,7 +76,8 @@ def read_pair(
     taken = OriginalImages(images, names, from_files=frames is None, packing=packing)
     cameras = read_cameras(options, taken)
     known = read_known(options, cameras)
-    masks = read_masks(options, images, cameras.views, from_files=frames is None, overlays=overlays)
+    stored_masks = read_masks(options, images, cameras.views, from_files=frames is None, overlays=overlays)
+    masks = undistorted_masks(stored_masks, images, cameras.views)
     views = [pinhole(*view, config) for view in zip(images, cameras.views, strict=True)]
     make_guidance = _unposed_guidance if options.estimate_pose else _posed_guidance
     guidance = make_guidance(options, views, cameras, known, masks)

@@ -22,7 +22,7 @@ from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.pose_check import CheckedPoses
 from geodiff_plugin.evidence.prepare import cleaned, pinhole
-from geodiff_plugin.evidence.valid import BLEND_PX, as_mask, content_mask, filled_by_undistortion
+from geodiff_plugin.evidence.valid import BLEND_PX, as_mask, outside_borders, undistorted_mask
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.runtime.prefetch import prefetch_evidence
 from geodiff_plugin.streaming.sources import StereoFrame
@@ -55,10 +55,11 @@ def setup_of_rig(rig: Rig, config: GuidanceConfig, mask: Any = None, right_mask:
         sized = rig.sized(left_size, right_size)
         left_view = (pinhole(left, sized.left, config), rig.K_left, np.eye(4))
         right_view = (pinhole(right, sized.right, config), rig.K_right, rig.E)
+        seen_left, seen_right = _seen(sized, left, right)
         guidance = GeometryGuidance.from_views(
             [left_view, right_view],
-            mask=_seen(sized.left) if mask is None else mask,
-            right_mask=_seen(sized.right) if right_mask is None else right_mask,
+            mask=seen_left if mask is None else mask,
+            right_mask=seen_right if right_mask is None else right_mask,
             unit=rig.unit,
             measured_baseline=rig.measured,
             config=config,
@@ -69,12 +70,20 @@ def setup_of_rig(rig: Rig, config: GuidanceConfig, mask: Any = None, right_mask:
     return setup
 
 
-def _seen(camera: Camera) -> np.ndarray | None:
-    """Return the pixels ``(H, W)`` bool that undistortion fills; ``None`` without distortion."""
-    if camera.lens is None or camera.size is None:
-        return None
-    width, height = camera.size
-    return filled_by_undistortion(np.ones((height, width), bool), camera)
+def _seen(rig: Rig, left: np.ndarray, right: np.ndarray) -> list[Tensor | None]:
+    """Return the pixels ``(H, W)`` bool of both views that undistortion fills from inside of any borders.
+
+    ``left`` and ``right (H, W, 3)`` are images with distortion. ``None`` stands for all pixels, or for a
+    camera without distortion, whose borders are detected with each check.
+    """
+    cameras = rig.left, rig.right
+    if all(camera.lens is None for camera in cameras):
+        return [None, None]
+    inside = outside_borders([as_image_01(image, "frame") for image in (left, right)], [None, None])
+    return [
+        None if camera.lens is None else undistorted_mask(mask, camera, (image.shape[0], image.shape[1]))
+        for camera, mask, image in zip(cameras, inside, (left, right), strict=True)
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +151,7 @@ class LiveRig:
         return PreparedFrame(frame, left, guidance, checks)
 
     def _check_images(self, guidance: GeometryGuidance, left: np.ndarray, right: np.ndarray) -> None:
-        """Find black borders, and whether the images of this rig need cleaning."""
+        """Find constant borders, and whether the images of this rig need cleaning."""
         self._masks = _valid_pixels(guidance, left, right)
         config = guidance.config
         images = [as_image_01(image, "frame") for image in (left, right)]
@@ -170,15 +179,15 @@ def _straight(image: np.ndarray, camera: Camera, config: GuidanceConfig) -> np.n
 def _valid_pixels(
     guidance: GeometryGuidance, left: np.ndarray, right: np.ndarray
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return the valid pixels ``(H, W)`` of both views: the masks of the rig, or all but black borders."""
+    """Return the valid pixels ``(H, W)`` of both views: the masks of the rig, or all but constant borders.
+
+    The blended edge of a border is left out too, because these pixels are used for all frames.
+    """
     (given,) = guidance.inputs
     known = (as_mask(given.mask, "mask", left.shape[:2]), given.views[0].valid)
-    pairs = zip(known, (left, right), strict=True)
-    of_left, of_right = (_inside_borders(image) if mask is None else mask for mask, image in pairs)
+    found = outside_borders([as_image_01(image, "frame") for image in (left, right)], known)
+    of_left, of_right = (
+        mask if mask is None or mask is own else eroded(mask, BLEND_PX)
+        for mask, own in zip(found, known, strict=True)
+    )
     return of_left, of_right
-
-
-def _inside_borders(image: np.ndarray) -> Tensor | None:
-    """Return the pixels inside of black borders, without their blended edge, which is used for all frames."""
-    valid = content_mask(as_image_01(image, "frame"))
-    return None if valid is None else eroded(valid, BLEND_PX)

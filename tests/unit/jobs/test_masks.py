@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin import InputError
-from geodiff_plugin.formats import find_mask
+from geodiff_plugin.formats import find_mask, undistorted
 from geodiff_plugin.jobs.masks import SAMPLES, SPAN, find_overlays
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef, options_of
@@ -66,6 +66,32 @@ def test_undistortion_leaves_pixels_without_content(files):
     left, right = masks_of(pair)
     black = (pair.left == 0).all(-1)
     assert black.any() and not left[black].any() and left.mean() > 0.5 and right is not None
+
+
+def with_white_frames(files: Path, folder: Path, width: int = 12) -> Path:
+    """The files with a white border on the left of both images."""
+    own = shutil.copytree(files, folder)
+    for name in ("left", "right"):
+        image = (image_of(files, name) * 255).round().astype(np.uint8)
+        image[:, :width] = 255
+        Image.fromarray(image).save(own / f"{name}.png")
+    return own
+
+
+def test_borders_of_both_images_are_found_before_undistortion_and_next_to_overlays(files, tmp_path):
+    own = with_white_frames(files, tmp_path / "own")
+    height, width = image_of(files, "left").shape[:2]
+    pair = read_pair(options(own, distortion=("-0.1,0,0,0",)))
+    for mask, camera in zip(masks_of(pair), pair.cameras, strict=True):
+        white = np.zeros((*mask.shape, 3), np.float32)
+        white[:, :12] = 1
+        straight = undistorted(white, camera)[..., 0] > 0
+        assert straight.any() and not mask[straight].any() and mask.mean() > 0.7
+    overlays = np.zeros((height, width), bool)
+    overlays[:5, 40:50] = True
+    left, right = masks_of(read_pair(options(own), overlays=overlays))
+    assert not left[:, :12].any() and not left[:5, 40:50].any() and left[8:, 20:].all()
+    assert not right[:, :12].any() and right[8:, 20:].all()
 
 
 def test_a_mask_of_another_size_is_an_error_that_names_the_option(files, tmp_path):
