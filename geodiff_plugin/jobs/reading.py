@@ -78,7 +78,10 @@ def read_pair(
     known = read_known(options, cameras)
     stored_masks = read_masks(options, images, cameras.views, from_files=frames is None, overlays=overlays)
     masks = undistorted_masks(stored_masks, images, cameras.views)
-    views = [pinhole(*view, config) for view in zip(images, cameras.views, strict=True)]
+    views = [
+        pinhole(image, camera, config, mask)
+        for image, camera, mask in zip(images, cameras.views, stored_masks, strict=True)
+    ]
     make_guidance = _unposed_guidance if options.estimate_pose else _posed_guidance
     guidance = make_guidance(options, views, cameras, known, masks)
     guidance.add_findings([*cameras.findings, *([] if overlays is None else [overlay_finding(overlays)])])
@@ -87,7 +90,7 @@ def read_pair(
         check_colmap_names(unique_names(options.image_files().values()))
     prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
     rig = cameras.rig or _estimated_rig(guidance, cameras)
-    return PairInputs(views[0], rig, guidance, cameras.distorted, prior_map, cameras.views)
+    return PairInputs(views[0], rig, guidance, cameras.distorted, prior_map, cameras.views, stored_masks)
 
 
 def begin_pair(

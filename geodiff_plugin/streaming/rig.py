@@ -7,7 +7,7 @@ warps, and the facts of its checks, so that their verdicts state the same reason
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -37,6 +37,7 @@ class RigSetup(NamedTuple):
 
     cameras: tuple[Camera, Camera]
     guidance: GeometryGuidance
+    masks: Sequence[Tensor | None] = (None, None)  # (H, W) bool, valid pixels with distortion; None for all
 
 
 #: Makes the setup of a rig from the left and right image of its first frame, ``(H, W, 3)`` float32 in [0, 1].
@@ -53,9 +54,13 @@ def setup_of_rig(rig: Rig, config: GuidanceConfig, mask: Any = None, right_mask:
         check_calibrated_size(left_size, rig.size_left, "the left frame", rig.source, hint)
         check_calibrated_size(right_size, rig.size_right, "the right frame", rig.source, hint)
         sized = rig.sized(left_size, right_size)
-        left_view = (pinhole(left, sized.left, config), rig.K_left, np.eye(4))
-        right_view = (pinhole(right, sized.right, config), rig.K_right, rig.E)
-        seen_left, seen_right = _seen(sized, left, right)
+        cameras, masks = (sized.left, sized.right), _bent_masks(sized, left, right)
+        left_view = (pinhole(left, sized.left, config, masks[0]), rig.K_left, np.eye(4))
+        right_view = (pinhole(right, sized.right, config, masks[1]), rig.K_right, rig.E)
+        seen_left, seen_right = (
+            None if camera.lens is None else undistorted_mask(valid, camera, image.shape[:2])
+            for valid, camera, image in zip(masks, cameras, (left, right), strict=True)
+        )
         guidance = GeometryGuidance.from_views(
             [left_view, right_view],
             mask=seen_left if mask is None else mask,
@@ -65,25 +70,19 @@ def setup_of_rig(rig: Rig, config: GuidanceConfig, mask: Any = None, right_mask:
             config=config,
         )
         guidance.calibrated = True
-        return RigSetup((sized.left, sized.right), guidance)
+        return RigSetup(cameras, guidance, masks)
 
     return setup
 
 
-def _seen(rig: Rig, left: np.ndarray, right: np.ndarray) -> list[Tensor | None]:
-    """Return the pixels ``(H, W)`` bool of both views that undistortion fills from inside of any borders.
+def _bent_masks(rig: Rig, left: np.ndarray, right: np.ndarray) -> list[Tensor | None]:
+    """Return the pixels ``(H, W)`` bool inside of borders of images ``(H, W, 3)`` with lens distortion.
 
-    ``left`` and ``right (H, W, 3)`` are images with distortion. ``None`` stands for all pixels, or for a
-    camera without distortion, whose borders are detected with each check.
+    ``None`` stands for all pixels. Borders of images without distortion are found with each check.
     """
-    cameras = rig.left, rig.right
-    if all(camera.lens is None for camera in cameras):
+    if rig.left.lens is None and rig.right.lens is None:
         return [None, None]
-    inside = outside_borders([as_image_01(image, "frame") for image in (left, right)], [None, None])
-    return [
-        None if camera.lens is None else undistorted_mask(mask, camera, (image.shape[0], image.shape[1]))
-        for camera, mask, image in zip(cameras, inside, (left, right), strict=True)
-    ]
+    return outside_borders([as_image_01(image, "frame") for image in (left, right)], [None, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +133,8 @@ class LiveRig:
         checks = bool(self._check_every) and self._count % self._check_every == 0
         with captured_warnings() as warned:
             setup = self._setup = self._setup or self._make(*map(_as_01, (frame.left, frame.right)))
-            pairs = zip((frame.left, frame.right), setup.cameras, strict=True)
-            left, right = (_straight(image, camera, setup.guidance.config) for image, camera in pairs)
+            views = zip((frame.left, frame.right), setup.cameras, setup.masks, strict=True)
+            left, right = (_straight(*view, setup.guidance.config) for view in views)
             if checks or self._count == 0:
                 self._check_images(setup.guidance, left, right)
             guidance = setup.guidance.for_frame(right, *self._masks)
@@ -155,7 +154,8 @@ class LiveRig:
         self._masks = _valid_pixels(guidance, left, right)
         config = guidance.config
         images = [as_image_01(image, "frame") for image in (left, right)]
-        clean = all(one is other for one, other in zip(images, cleaned(images, config), strict=True))
+        clear = cleaned(images, self._masks, config)
+        clean = all(one is other for one, other in zip(images, clear, strict=True))
         pose = "refine" if self._check_every else "given"
         self._config = config.changed(pose=pose, clean_images=config.clean_images and not clean)
 
@@ -171,9 +171,11 @@ def _as_01(image: np.ndarray) -> np.ndarray:
     return image_01
 
 
-def _straight(image: np.ndarray, camera: Camera, config: GuidanceConfig) -> np.ndarray:
+def _straight(
+    image: np.ndarray, camera: Camera, valid: Tensor | None, config: GuidanceConfig
+) -> np.ndarray:
     """Return an image without lens distortion; the same object if there is none."""
-    return image if camera.lens is None else pinhole(_as_01(image), camera, config)
+    return image if camera.lens is None else pinhole(_as_01(image), camera, config, valid)
 
 
 def _valid_pixels(
