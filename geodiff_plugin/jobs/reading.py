@@ -76,7 +76,9 @@ def read_pair(
     taken = OriginalImages(images, names, from_files=frames is None, packing=packing)
     cameras = read_cameras(options, taken)
     known = read_known(options, cameras)
-    stored_masks = read_masks(options, images, cameras.views, from_files=frames is None, overlays=overlays)
+    stored_masks = read_masks(
+        options, images, cameras.views, from_files=frames is None, packing=packing, overlays=overlays
+    )
     masks = undistorted_masks(stored_masks, images, cameras.views)
     views = [
         pinhole(image, camera, config, mask)

@@ -60,6 +60,24 @@ def test_pixels_of_alpha_0_are_not_valid(files, tmp_path):
     assert np.array_equal(masks_of(pair)[0], valid) and pair.left.shape == image.shape
 
 
+@pytest.mark.filterwarnings("ignore:.*transparent pixels")
+@pytest.mark.parametrize("layout", ["full", "over-under"])
+def test_the_alpha_channel_of_an_image_with_both_views_is_split_like_it(files, tmp_path, layout):
+    axis = 0 if "over" in layout else 1
+    image = np.concatenate([(image_of(files, "left") * 255).round().astype(np.uint8)] * 2, axis)
+    left, right = left_part(files, "left"), left_part(files, "left")[:, ::-1]
+    alpha = np.concatenate([left, right], axis).astype(np.uint8) * 255
+    Image.fromarray(np.dstack([image, alpha])).save(tmp_path / "both.png")
+    further = image_of(files, "third")
+    shown = np.arange(further.shape[1])[None].repeat(len(further), 0) > 9
+    rgba = np.dstack([(further * 255).astype(np.uint8), shown.astype(np.uint8) * 255])
+    Image.fromarray(rgba).save(tmp_path / "third.png")
+    more = {"left": tmp_path / "both.png", "right": None, "side_by_side": layout, "k_right": None}
+    pair = read_pair(options(files, "third", **more | {"view": (tmp_path / "third.png",)}))
+    for found, expected in zip(masks_of(pair), (left, right, shown), strict=True):
+        assert np.array_equal(found, expected)
+
+
 def test_undistortion_leaves_pixels_without_content(files):
     """A pincushion lens: corners of the straight image lie outside of the one that was taken."""
     pair = read_pair(options(files, distortion=("0.3,0,0,0",)))
