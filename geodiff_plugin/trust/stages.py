@@ -122,7 +122,7 @@ class ResultStage:
     rank_correlation: Tensor | None = None  # (), rank correlation of the prior's first map with the evidence
     prior_error: Tensor | None = None  # (), error of the prior's map, log depth
     on_edge: Tensor | None = None  # (), whether the scale search ended at the edge of its range
-    over_prior: Tensor | None = None  # (E, N) ratio of the depth to a metric prior's depth
+    over_prior: Tensor | None = None  # (E, N) ratio to a metric prior's depth, NaN where not valid
 
     def mean(self, values: Tensor) -> Tensor:
         """Mean ``()`` of a map ``(1, 1, H, W)`` on any grid over the valid pixels of the left image."""
