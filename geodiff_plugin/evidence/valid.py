@@ -45,6 +45,8 @@ MIN_BLACK = 0.95
 MIN_CONTACT = 0.65
 #: Distance in pixels from a detected border up to which image content is not used.
 BLEND_PX = 3
+#: Distance in pixels from a detected border up to which pixels get no depth: they show the border in part.
+RIM_PX = 1
 #: Maximum difference in grey levels within a border of another colour: surfaces have noise and shading.
 FLAT = 2
 #: Difference in grey levels to such a border above which a pixel shows the scene.
@@ -158,15 +160,16 @@ def both(one: Tensor | None, other: Tensor | None) -> Tensor | None:
 def outside_borders(images_01: Sequence[Tensor], given: Sequence[Tensor | None]) -> list[Tensor | None]:
     """Return the valid pixels ``(H, W)`` bool of each view ``(3, H, W)`` of one scene; ``None`` for all.
 
-    These are ``given``, or else all but black borders of the view. Without any given, they also exclude the
-    common borders of all views.
+    These are ``given``, or else all but black borders of the view and their rim. Without any given, they also
+    exclude the common borders of all views.
     """
     common = common_borders(images_01) if all(mask is None for mask in given) else None
     borders: Sequence[Tensor | None] = [None] * len(images_01) if common is None else common
-    return [
-        both(content_mask(image), border) if mask is None else mask
-        for image, mask, border in zip(images_01, given, borders, strict=True)
-    ]
+    masks = list[Tensor | None]()
+    for image, mask, border in zip(images_01, given, borders, strict=True):
+        found = both(content_mask(image), border) if mask is None else None
+        masks.append(mask if found is None else eroded(found, RIM_PX))
+    return masks
 
 
 def content_mask(image_01: Tensor) -> Tensor | None:
@@ -306,5 +309,6 @@ def neutral_views(
         if mask is None:
             views.append((image, None))
         else:
-            views.append((filled(image, mask if own is not None else eroded(mask, BLEND_PX)), mask))
+            used = mask if own is not None else eroded(mask, BLEND_PX - RIM_PX)
+            views.append((filled(image, used), mask))
     return views

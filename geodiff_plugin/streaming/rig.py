@@ -22,7 +22,7 @@ from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.pose_check import CheckedPoses
 from geodiff_plugin.evidence.prepare import cleaned, pinhole
-from geodiff_plugin.evidence.valid import BLEND_PX, as_mask, outside_borders, undistorted_mask
+from geodiff_plugin.evidence.valid import BLEND_PX, RIM_PX, as_mask, outside_borders, undistorted_mask
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.runtime.prefetch import prefetch_evidence
 from geodiff_plugin.streaming.sources import StereoFrame
@@ -171,9 +171,7 @@ def _as_01(image: np.ndarray) -> np.ndarray:
     return image_01
 
 
-def _straight(
-    image: np.ndarray, camera: Camera, valid: Tensor | None, config: GuidanceConfig
-) -> np.ndarray:
+def _straight(image: np.ndarray, camera: Camera, valid: Tensor | None, config: GuidanceConfig) -> np.ndarray:
     """Return an image without lens distortion; the same object if there is none."""
     return image if camera.lens is None else pinhole(_as_01(image), camera, config, valid)
 
@@ -189,7 +187,7 @@ def _valid_pixels(
     known = (as_mask(given.mask, "mask", left.shape[:2]), given.views[0].valid)
     found = outside_borders([as_image_01(image, "frame") for image in (left, right)], known)
     of_left, of_right = (
-        mask if mask is None or mask is own else eroded(mask, BLEND_PX)
+        mask if mask is None or mask is own else eroded(mask, BLEND_PX - RIM_PX)
         for mask, own in zip(found, known, strict=True)
     )
     return of_left, of_right
