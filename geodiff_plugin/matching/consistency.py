@@ -101,7 +101,7 @@ def window_mean(maps: Tensor, radius: int) -> Tensor:
         return maps
     for axis, padding in ((-2, (0, 0, radius, radius)), (-1, (radius, radius))):
         size = maps.shape[axis]
-        at = torch.arange(size, dtype=maps.dtype)
+        at = torch.arange(size, dtype=maps.dtype, device=maps.device)
         count = (at + radius).clamp_max(size - 1) - (at - radius).clamp_min(0) + 1.0
         maps = _sums(F.pad(maps, padding), length, axis) / (count[:, None] if axis == -2 else count)
     return maps
@@ -113,7 +113,7 @@ def _sums(values: Tensor, length: int, axis: int) -> Tensor:
     ``avg_pool2d`` takes ``length`` steps, on one thread without vector instructions.
     """
     count = values.shape[axis] - length + 1
-    total = torch.zeros(())
+    total = values.new_zeros(())
     start, block = 0, 1  # ``values`` are sums of ``block`` consecutive ones
     while True:
         if length & block:
