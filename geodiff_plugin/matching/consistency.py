@@ -99,11 +99,11 @@ def window_mean(maps: Tensor, radius: int) -> Tensor:
             padding = (window[0] // 2, window[1] // 2)
             maps = F.avg_pool2d(maps, window, 1, padding, count_include_pad=False)
         return maps
-    for axis, padding in ((-2, (0, 0, radius, radius)), (-1, (radius, radius))):
+    for axis, sides in ((-2, (0, 0, radius, radius)), (-1, (radius, radius))):
         size = maps.shape[axis]
         at = torch.arange(size, dtype=maps.dtype, device=maps.device)
         count = (at + radius).clamp_max(size - 1) - (at - radius).clamp_min(0) + 1.0
-        maps = _sums(F.pad(maps, padding), length, axis) / (count[:, None] if axis == -2 else count)
+        maps = _sums(F.pad(maps, sides), length, axis) / (count[:, None] if axis == -2 else count)
     return maps
 
 
