@@ -9,7 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geodiff_plugin.evidence.valid import both, neutral, read_mask, undistorted_mask, without_overlays
+from geodiff_plugin.evidence.valid import (
+    both,
+    neutral_views,
+    outside_borders,
+    read_mask,
+    undistorted_mask,
+    without_overlays,
+)
 from geodiff_plugin.formats import CaptureFrame, read_alpha, undistorted
 
 
@@ -36,18 +43,21 @@ def masked_image(frame: CaptureFrame, stored: np.ndarray, overlays: np.ndarray |
     A frame with a mask may show overlays; its mask states what is valid.
     """
     valid = valid_in_files(frame)
-    if frame.camera.lens is not None:
-        valid = undistorted_mask(stored, valid, frame.camera)
+    overlays = overlays if frame.mask is None else None
+    if frame.camera.lens is not None or overlays is not None:
+        (valid,) = outside_borders([torch.from_numpy(stored).permute(2, 0, 1)], [valid])
+    size = stored.shape[0], stored.shape[1]
+    valid = undistorted_mask(valid, frame.camera, size)
     image = undistorted(stored, frame.camera)
-    if overlays is not None and frame.mask is None:
-        valid = without_overlays(image, valid, overlays)
+    if overlays is not None:
+        valid = without_overlays(valid, overlays, size)
     return MaskedImage(image, None if valid is None else valid.numpy())
 
 
 def masked_grey(masked: MaskedImage) -> np.ndarray:
     """Convert an image for ``solve_capture`` to grey uint8, a masked array if some pixels are not valid."""
     given = None if masked.valid is None else torch.from_numpy(masked.valid)
-    planes, valid = neutral(torch.from_numpy(masked.image).permute(2, 0, 1), given)
+    ((planes, valid),) = neutral_views([torch.from_numpy(masked.image).permute(2, 0, 1)], [given])
     pixels = np.ascontiguousarray(planes.permute(1, 2, 0).numpy())
     grey = np.rint(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) * 255).astype(np.uint8)
     return grey if valid is None else np.ma.MaskedArray(grey, ~valid.numpy())

@@ -16,12 +16,13 @@ from torch import Tensor
 import geodiff_plugin.matching as matching
 from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin._internal.threads import BackgroundTask, leaves_cpu_free
-from geodiff_plugin.cameras import Camera, PosedViews
+from geodiff_plugin.cameras import Camera, PosedViews, eroded
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.evidence.plan import EvidencePlan, RowTasks, fit_in_background
 from geodiff_plugin.evidence.pose_check import CheckedPoses, check_poses, image_facts, used_as_given
+from geodiff_plugin.evidence.valid import BLEND_PX
 from geodiff_plugin.formats import undistorted
 from geodiff_plugin.matching import clean
 from geodiff_plugin.matching.matches import RELIABLE, read_above
@@ -32,17 +33,31 @@ from geodiff_plugin.scale.points import reliable_matches
 from geodiff_plugin.trust import FactSheet, MatchesStage, measure
 
 
-def cleaned(images: Sequence[Tensor], config: GuidanceConfig) -> Sequence[Tensor]:
-    """Remove flaws from images ``(3, H, W)`` in [0, 1] of native size if ``clean_images`` is set."""
-    return clean(images, config.sweep_pixels) if config.clean_images else images
+def cleaned(
+    images: Sequence[Tensor], masks: Sequence[Tensor | None], config: GuidanceConfig
+) -> Sequence[Tensor]:
+    """Remove flaws from images ``(3, H, W)`` in [0, 1] of native size if ``clean_images`` is set.
+
+    Flaws are measured where ``masks (H, W)`` bool state that pixels are valid; ``None`` for all.
+    """
+    if not config.clean_images:
+        return images
+    # At the edge of a detected border, content is smooth up to this distance inside.
+    measured = [None if mask is None else eroded(mask, BLEND_PX) for mask in masks]
+    return clean(images, config.sweep_pixels, measured)
 
 
-def pinhole(image_01: np.ndarray, camera: Camera, config: GuidanceConfig) -> np.ndarray:
-    """Return the image ``(H, W, 3)`` of a camera without its lens distortion."""
+def pinhole(
+    image_01: np.ndarray, camera: Camera, config: GuidanceConfig, valid: Tensor | None = None
+) -> np.ndarray:
+    """Return the image ``(H, W, 3)`` of a camera without its lens distortion.
+
+    ``valid (H, W)`` bool are its valid pixels before; ``None`` for all.
+    """
     if camera.lens is None:
         return image_01
     # Clean before resampling, which hides the block boundaries of JPEG compression.
-    (ready,) = cleaned([torch.from_numpy(image_01).permute(2, 0, 1)], config)
+    (ready,) = cleaned([torch.from_numpy(image_01).permute(2, 0, 1)], [valid], config)
     return undistorted(ready.permute(1, 2, 0).contiguous().numpy(), camera)
 
 
@@ -50,7 +65,7 @@ def _with_clean_images(posed: PosedViews, config: GuidanceConfig) -> PosedViews:
     """Return the views with cleaned images; the same object if all images were clean."""
     views = [posed.left, *posed.rights]
     images = [view.image_01 for view in views]
-    clear = cleaned(images, config)
+    clear = cleaned(images, [view.valid for view in views], config)
     if all(one is other for one, other in zip(images, clear, strict=True)):
         return posed
     left, *rights = (view._replace(image_01=image) for view, image in zip(views, clear, strict=True))

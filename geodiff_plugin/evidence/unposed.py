@@ -120,7 +120,8 @@ class _Images(NamedTuple):
     def of(cls, images: Sequence[Tensor], valid: Sequence[Tensor | None]) -> _Images:
         """Clean images and make invalid pixels neutral: outside of the masks, or in constant borders."""
         pairs = neutral_views(images, valid)
-        return cls(cleaned([image for image, _ in pairs], DEFAULT), [mask for _, mask in pairs])
+        masks = [mask for _, mask in pairs]
+        return cls(cleaned([image for image, _ in pairs], masks, DEFAULT), masks)
 
 
 def _posed(unposed: _Images, Ks: Sequence[np.ndarray], Ts: Iterable[np.ndarray]) -> PosedViews:

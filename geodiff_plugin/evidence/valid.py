@@ -45,6 +45,8 @@ MIN_BLACK = 0.95
 MIN_CONTACT = 0.65
 #: Distance in pixels from a detected border up to which image content is not used.
 BLEND_PX = 3
+#: Distance in pixels from a detected border up to which pixels get no depth: they show the border in part.
+RIM_PX = 1
 #: Maximum difference in grey levels within a border of another colour: surfaces have noise and shading.
 FLAT = 2
 #: Difference in grey levels to such a border above which a pixel shows the scene.
@@ -107,15 +109,14 @@ def _have_same_aspect(first: tuple[int, int], second: tuple[int, int]) -> bool:
     return abs(larger[0] * width / larger[1] - height) < 1
 
 
-def undistorted_mask(image_01: np.ndarray, valid: Tensor | None, camera: Camera) -> Tensor | None:
-    """Return the valid pixels after undistortion of an image ``(H, W, 3)``, given those before.
+def undistorted_mask(valid: Tensor | None, camera: Camera, size: tuple[int, int]) -> Tensor | None:
+    """Return the valid pixels after undistortion of an image of ``size (H, W)``, given those before.
 
-    Black borders of the image are detected here if none are given, because the lens bends them.
+    The same mask if the camera has no lens. Borders have to be detected before, because a lens bends them.
     """
-    if valid is None:
-        valid = content_mask(torch.from_numpy(image_01).permute(2, 0, 1))
-    before = np.ones(image_01.shape[:2], bool) if valid is None else valid.numpy()
-    inside = filled_by_undistortion(before, camera)
+    if camera.lens is None:
+        return valid
+    inside = filled_by_undistortion(np.ones(size, bool) if valid is None else valid.numpy(), camera)
     return None if inside.all() else torch.from_numpy(inside)
 
 
@@ -125,14 +126,12 @@ def filled_by_undistortion(valid: np.ndarray, camera: Camera) -> np.ndarray:
     return inside
 
 
-def without_overlays(image_01: np.ndarray, valid: Tensor | None, overlays: np.ndarray) -> Tensor:
-    """Return the valid pixels of an image ``(H, W, 3)`` outside of static pixels ``overlays (h, w)`` bool.
+def without_overlays(valid: Tensor | None, overlays: np.ndarray, size: tuple[int, int]) -> Tensor:
+    """Return the valid pixels of an image of ``size (H, W)`` outside of static pixels.
 
-    The overlays may have another size. Black borders of the image are detected if ``valid`` is ``None``.
+    These, ``overlays (h, w)`` bool, may have another size.
     """
-    if valid is None:
-        valid = content_mask(torch.from_numpy(image_01).permute(2, 0, 1))
-    outside = resized_mask(~torch.from_numpy(overlays), (image_01.shape[0], image_01.shape[1]))
+    outside = resized_mask(~torch.from_numpy(overlays), size)
     return outside if valid is None else outside & valid
 
 
@@ -156,6 +155,21 @@ def both(one: Tensor | None, other: Tensor | None) -> Tensor | None:
     if one is None or other is None:
         return other if one is None else one
     return one & other
+
+
+def outside_borders(images_01: Sequence[Tensor], given: Sequence[Tensor | None]) -> list[Tensor | None]:
+    """Return the valid pixels ``(H, W)`` bool of each view ``(3, H, W)`` of one scene; ``None`` for all.
+
+    These are ``given``, or else all but black borders of the view and their rim. Without any given, they also
+    exclude the common borders of all views.
+    """
+    common = common_borders(images_01) if all(mask is None for mask in given) else None
+    borders: Sequence[Tensor | None] = [None] * len(images_01) if common is None else common
+    masks = list[Tensor | None]()
+    for image, mask, border in zip(images_01, given, borders, strict=True):
+        found = both(content_mask(image), border) if mask is None else None
+        masks.append(mask if found is None else eroded(found, RIM_PX))
+    return masks
 
 
 def content_mask(image_01: Tensor) -> Tensor | None:
@@ -286,26 +300,15 @@ def neutral_views(
 ) -> list[tuple[Tensor, Tensor | None]]:
     """Make the content of each view of one scene neutral where it is not valid; also returns valid pixels.
 
-    These, ``(H, W)`` bool, are ``given``, or else all but black borders of the view and common borders of all
-    views, if ``detects_borders``; ``None`` stands for all.
-    """
-    common = common_borders(images_01) if detects_borders and all(mask is None for mask in given) else None
-    borders: Sequence[Tensor | None] = [None] * len(images_01) if common is None else common
-    return [
-        (image, mask) if mask is None and not detects_borders else neutral(image, mask, border)
-        for image, mask, border in zip(images_01, given, borders, strict=True)
-    ]
-
-
-def neutral(
-    image_01: Tensor, given: Tensor | None, border: Tensor | None = None
-) -> tuple[Tensor, Tensor | None]:
-    """Make the content of an image ``(3, H, W)`` neutral where it is not valid; also returns valid pixels.
-
-    These, ``(H, W)`` bool, are ``given``, or else all but black borders, and those in ``border``; ``None``
+    These, ``(H, W)`` bool, are ``given``, or else those ``outside_borders`` if ``detects_borders``; ``None``
     stands for all.
     """
-    if given is not None:
-        return filled(image_01, given), given
-    valid = both(content_mask(image_01), border)
-    return (image_01, None) if valid is None else (filled(image_01, eroded(valid, BLEND_PX)), valid)
+    masks = outside_borders(images_01, given) if detects_borders else given
+    views = list[tuple[Tensor, Tensor | None]]()
+    for image, own, mask in zip(images_01, given, masks, strict=True):
+        if mask is None:
+            views.append((image, None))
+        else:
+            used = mask if own is not None else eroded(mask, BLEND_PX - RIM_PX)
+            views.append((filled(image, used), mask))
+    return views

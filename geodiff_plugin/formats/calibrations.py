@@ -175,7 +175,8 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', named.read_named, (1, 2, 3)),
     "ros": CalibrationFormat(
         "pair of ROS camera_info (projection_matrix)",
-        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", ros.read_ros, (2,)),
+        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", ros.read_ros, (2,),
+        one_is_enough=True),
     "stereodemo": CalibrationFormat(
         "stereodemo JSON, or lines of names and numbers (fx)",
         rf'{_json("fx")}|^[ \t]*fx[ \t]*[:=][ \t]*{_NUMBER}', stereo.read_stereodemo),

@@ -354,7 +354,8 @@ def split_views(image: Any, K: Any, layout: str | None = None) -> SplitViews:
 
     >>> left, right, K = split_views(image, K, "half")
 
-    Half layouts squeeze the views. They stay as they are in the image, and K is adapted to their pixels.
+    Half layouts squeeze the views. They stay as they are in the image, and K is adapted to their pixels. An
+    alpha channel is split like the colours.
 
     Args:
         image: PIL image, numpy ``(H, W, C)`` or torch ``(C, H, W)``.
@@ -365,9 +366,12 @@ def split_views(image: Any, K: Any, layout: str | None = None) -> SplitViews:
     Raises:
         InputError: a wrong type or layout, or an odd width or height of the image.
     """
-    pixels = np.asarray(image.convert("RGB")) if isinstance(image, Image.Image) else _hwc(image, "image")
+    if isinstance(image, Image.Image):
+        pixels = np.asarray(image.convert("RGBA" if has_alpha(image) else "RGB"))
+    else:
+        pixels = _hwc(image, "image")
     if layout is None:
-        packing = find_packing([pixels], "the image")
+        packing = find_packing([pixels[..., :3]], "the image")
         if packing.finding is not None:
             warn(packing.finding)
     else:

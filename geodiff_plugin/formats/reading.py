@@ -44,8 +44,11 @@ def _text(file: Path) -> str:
     return storage.text_of_npz(file) if is_npz else colmap.calibration_text(file)
 
 
-def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
-    """Return the common format of all files; raise an error if their number does not fit it."""
+def _format_of(texts: dict[Path, str], is_alone: bool = False) -> CalibrationFormat:
+    """Return the common format of all files; raise an error if their number does not fit it.
+
+    ``is_alone`` states that there may be a left image only.
+    """
     names = set()
     for path, text in texts.items():
         fits = [name for name, each in CALIBRATION_FORMATS.items() if re.search(each.mark, text, re.M)]
@@ -58,7 +61,7 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     if len(names) != 1:
         bad_value("calibration", "files of the same format", " and ".join(sorted(names)) or "none")
     entry = CALIBRATION_FORMATS[names.pop()]
-    if len(texts) not in entry.file_counts:
+    if len(texts) not in entry.file_counts and not (is_alone and entry.one_is_enough and len(texts) == 1):
         _raise_file_count(entry, list(texts))
     return entry
 
@@ -109,6 +112,7 @@ def read_calibration(
     image_size: tuple[int, int] | None = None,
     baseline_m: float | None = None,
     distorted: bool = False,
+    is_alone: bool = False,
 ) -> Rig:
     """Read a calibration file of any supported format.
 
@@ -123,6 +127,8 @@ def read_calibration(
             RealSense), of the whole sensor (OAK-D), or without one (NeRF's transforms.json).
         baseline_m: measured distance between the cameras in metres; replaces the file's.
         distorted: whether the caller removes lens distortion from the images (``Camera.lens``).
+        is_alone: whether there is only a left image, for which one ROS ``camera_info`` is enough. Both
+            cameras of the rig are then the same.
 
     Returns:
         The rig: K in pixels of the images that the file is for, E in metres. A right camera 0.12 m to the
@@ -133,11 +139,11 @@ def read_calibration(
         ValueError: unknown or truncated format, missing cameras, or lens distortion unless ``distorted``.
     """
     texts = _texts(path)
-    entry = _format_of(texts)
+    entry = _format_of(texts, is_alone)
     source = " and ".join(map(str, texts))
     if cameras is not None and not entry.uses_cameras:
         bad_value("cameras", "omitted for a file of two cameras", cameras, "It selects among more than two.")
-    choice = CameraChoice(cameras, image_folder_hint, image_names, image_size, baseline_m)
+    choice = CameraChoice(cameras, image_folder_hint, image_names, image_size, baseline_m, is_alone)
     other = "It may be from a different program, or describe a single camera."
     with reading_file(source, entry.summary, *texts.values(), hint=other):
         rig = replace(entry.read(_with_companions(entry, texts), choice), source=source)
@@ -152,7 +158,7 @@ def read_calibration(
 
 def is_as_stored(path: PathLike | Sequence[PathLike]) -> bool:
     """Whether a calibration refers to pixels as stored, before EXIF orientation."""
-    return _format_of(_texts(path)).as_stored
+    return _format_of(_texts(path), is_alone=True).as_stored
 
 
 def has_pose_per_image(path: PathLike | Sequence[PathLike]) -> bool:

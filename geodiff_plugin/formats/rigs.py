@@ -62,13 +62,17 @@ CHECK_FILE = "Check the calibration file."
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """Selects two cameras of a file with more than two, and the resolution; see ``read_calibration``."""
+    """Selects two cameras of a file with more than two, and the resolution; see ``read_calibration``.
+
+    With ``is_alone``, only the left camera is used, for a left image without a second view.
+    """
 
     cameras: tuple[int, int] | None = None
     image_folder_hint: str | None = None
     image_names: tuple[str, str] | None = None
     image_size: Size | None = None
     baseline_m: float | None = None
+    is_alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,10 +95,10 @@ class CalibrationFormat:
 
     ``mark`` is a regular expression that matches its texts, and no text of earlier formats; ``^`` matches at
     line starts. ``read`` builds the rig with ``make_rig``, and may raise any error of a missing entry.
-    ``file_counts`` is the allowed number of files. Files may have more than two cameras (``uses_cameras``), a
-    pose without a known unit per image (``by_image``), or cameras of the pixels as stored, before EXIF
-    orientation (``as_stored``). ``companions`` returns the names of further files in the same folder, whose
-    texts ``read`` takes too.
+    ``file_counts`` is the allowed number of files; for a left image alone one is enough if ``one_is_enough``.
+    Files may have more than two cameras (``uses_cameras``), a pose without a known unit per image
+    (``by_image``), or cameras of the pixels as stored, before EXIF orientation (``as_stored``).
+    ``companions`` returns the names of further files in the same folder, whose texts ``read`` takes too.
     """
 
     summary: str
@@ -104,6 +108,7 @@ class CalibrationFormat:
     uses_cameras: bool = False
     by_image: bool = False
     as_stored: bool = False
+    one_is_enough: bool = False
     companions: Callable[[str], list[str]] | None = None
 
 

@@ -15,6 +15,7 @@ from geodiff_plugin.formats.rigs import (
     CameraChoice,
     RawCamera,
     array_of,
+    make_rig,
     projected,
     rectified_from,
 )
@@ -97,9 +98,15 @@ def _image_size(info: Entries, binning: np.ndarray) -> tuple[Any, Any]:
 def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """Read files of ``camera_calibration`` or printed messages: rectified images, from ``P``.
 
-    Files with ``rectified: false`` (``recordings.stereo_calibration``) describe raw images.
+    Files with ``rectified: false`` (``recordings.stereo_calibration``) describe raw images. For a left image
+    alone one file is enough, even if its ``P`` is zero, as for a camera that was not calibrated in a pair.
     """
-    return _rig_of_infos([read_yaml(text) for text in texts], choice)
+    infos = [read_yaml(text) for text in texts]
+    return (
+        _single_camera(infos[0], choice)
+        if choice.is_alone and len(infos) == 1
+        else _rig_of_infos(infos, choice)
+    )
 
 
 #: Headings in the older form of ``camera_calibration`` -> entries of the newer one.
@@ -157,6 +164,24 @@ def _rig_of_infos(infos: list[Entries], choice: CameraChoice) -> Rig:
     return with_raw.as_taken or rig if are_raw else with_raw
 
 
+def _single_camera(info: Entries, choice: CameraChoice) -> Rig:
+    """Return a rig of one camera twice: of the rectified image, or of the raw one if P is zero or missing."""
+    binning = _binning(info, choice)
+    size = _image_size(info, binning)
+    P = None if _of_ros(info, "P") is None else _projection(info, binning)
+    if info.get("rectified", True) and P is not None and P.any():
+        camera = RawCamera(P[:, :3], size)
+    else:
+        camera = _raw_camera(info, size, binning)
+    return make_rig(camera, camera, np.eye(4))
+
+
+def _raw_camera(info: Entries, size: tuple[Any, Any], binning: np.ndarray) -> RawCamera:
+    """Return the camera before rectification."""
+    K = _of_window(info, binning) @ array_of(_of_ros(info, "K"), (3, 3), "K")
+    return RawCamera(K, size, _of_ros(info, "D"), str(info["distortion_model"]))
+
+
 def _has_raw_camera(info: Entries) -> bool:
     """Whether entries for rectified images also describe the camera before rectification.
 
@@ -179,13 +204,7 @@ def _with_raw_cameras(
 ) -> Rig:
     """Return the rectified rig with its raw cameras."""
     left, right = (
-        RawCamera(
-            _of_window(info, binning) @ array_of(_of_ros(info, "K"), (3, 3), "K"),
-            size,
-            _of_ros(info, "D"),
-            str(info["distortion_model"]),
-        )
-        for info, size, binning in zip(infos, sizes, binnings, strict=True)
+        _raw_camera(info, size, binning) for info, size, binning in zip(infos, sizes, binnings, strict=True)
     )
     R_left, R_right = (_of_ros(info, "R") for info in infos)
     return rectified_from(rig, left, right, (R_left, R_right))

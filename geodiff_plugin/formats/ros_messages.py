@@ -28,6 +28,8 @@ AsSequence = Callable[[np.ndarray], Any]
 IMAGE, CAMERA_INFO, REGION = (
     f"sensor_msgs/msg/{name}" for name in ("Image", "CameraInfo", "RegionOfInterest")
 )
+#: Fields of a region of interest that change the camera.
+REGION_FIELDS = ("x_offset", "y_offset", "width", "height")
 
 
 def depth_values(depth_m: np.ndarray, encoding: str) -> np.ndarray:
@@ -77,11 +79,18 @@ def camera_info_text(info: Any, rectified: bool) -> str:
     for key in "DKRP":  # lower case in ROS 2
         entries[key] = np.array(getattr(info, key, getattr(info, key.lower(), ())), float).tolist()
     entries |= {f"binning_{axis}": int(getattr(info, f"binning_{axis}", 0)) for axis in "xy"}
+    if (roi := getattr(info, "roi", None)) is not None:  # Foxglove's messages have none
+        entries["roi"] = {name: int(getattr(roi, name)) for name in REGION_FIELDS}
     return yaml.safe_dump(entries)
 
 
-def rig_of_messages(left: Any, right: Any, rectified: bool = True) -> Rig:
+def rig_of_messages(
+    left: Any, right: Any, rectified: bool = True, image_size: tuple[int, int] | None = None
+) -> Rig:
     """Return the rig of the ``CameraInfo`` of both cameras, for rectified or raw images.
+
+    ``image_size`` is the ``(width, height)`` of the left image. Without it, messages that state a binning are
+    taken to describe the images before binning, which is wrong for some drivers.
 
     Raises:
         InputError: the cameras are not calibrated as a pair.
@@ -90,7 +99,8 @@ def rig_of_messages(left: Any, right: Any, rectified: bool = True) -> Rig:
     from geodiff_plugin.formats.rigs import CameraChoice
     from geodiff_plugin.formats.ros import read_ros
 
-    return read_ros(tuple(camera_info_text(info, rectified) for info in (left, right)), CameraChoice())
+    texts = tuple(camera_info_text(info, rectified) for info in (left, right))
+    return read_ros(texts, CameraChoice(image_size=image_size))
 
 
 def images_of_messages(left: Any, right: Any, name: str = "the topics") -> tuple[np.ndarray, np.ndarray]:

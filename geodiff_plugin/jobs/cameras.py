@@ -194,6 +194,7 @@ def _rig_of_file(options: DepthOptions, left_size: Size, names: tuple[str, str] 
     if names is None and options.right is not None:
         names = str(options.left), str(options.right)
     of: dict[str, Any] = {"image_names": names, "image_size": left_size, "baseline_m": options.baseline}
+    of["is_alone"] = options.right is None
     return read_calibration(options.calib, options.camera_pair(), str(options.left), distorted=True, **of)
 
 

@@ -103,7 +103,7 @@ def _setup(options: LiveOptions, source: CameraSource, notify: Notify) -> Setup:
             if finding.severity is Severity.ASSUMPTION:
                 notify(f"assumed: {finding}")
         of_left, of_right = inputs.cameras
-        return RigSetup((of_left, of_right), inputs.guidance)
+        return RigSetup((of_left, of_right), inputs.guidance, inputs.masks)
 
     return setup
 

@@ -36,7 +36,7 @@ from geodiff_plugin.jobs.cameras import (
     settled_packing,
 )
 from geodiff_plugin.jobs.known import KnownGeometry, read_known
-from geodiff_plugin.jobs.masks import find_overlays, read_masks
+from geodiff_plugin.jobs.masks import find_overlays, read_masks, undistorted_masks
 from geodiff_plugin.jobs.options import AUTO, DepthOptions, unique_names
 from geodiff_plugin.jobs.pairs import PairRef, file_digests
 from geodiff_plugin.jobs.records import JobLog, PairInputs, PairOrigin, ReadPair
@@ -76,8 +76,14 @@ def read_pair(
     taken = OriginalImages(images, names, from_files=frames is None, packing=packing)
     cameras = read_cameras(options, taken)
     known = read_known(options, cameras)
-    masks = read_masks(options, images, cameras.views, from_files=frames is None, overlays=overlays)
-    views = [pinhole(*view, config) for view in zip(images, cameras.views, strict=True)]
+    stored_masks = read_masks(
+        options, images, cameras.views, from_files=frames is None, packing=packing, overlays=overlays
+    )
+    masks = undistorted_masks(stored_masks, images, cameras.views)
+    views = [
+        pinhole(image, camera, config, mask)
+        for image, camera, mask in zip(images, cameras.views, stored_masks, strict=True)
+    ]
     make_guidance = _unposed_guidance if options.estimate_pose else _posed_guidance
     guidance = make_guidance(options, views, cameras, known, masks)
     guidance.add_findings([*cameras.findings, *([] if overlays is None else [overlay_finding(overlays)])])
@@ -86,7 +92,7 @@ def read_pair(
         check_colmap_names(unique_names(options.image_files().values()))
     prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
     rig = cameras.rig or _estimated_rig(guidance, cameras)
-    return PairInputs(views[0], rig, guidance, cameras.distorted, prior_map, cameras.views)
+    return PairInputs(views[0], rig, guidance, cameras.distorted, prior_map, cameras.views, stored_masks)
 
 
 def begin_pair(

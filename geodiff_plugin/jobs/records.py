@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from geodiff_plugin._internal.checks import captured_warnings
 from geodiff_plugin.cameras import Camera
@@ -52,6 +53,7 @@ class PairInputs:
         undistorted: whether lens distortion was removed from any view.
         prior_map: ``(h, w)``, NaN where unknown; ``None`` without ``--prior-map``.
         cameras: cameras of all views as taken, with their lenses, left one first.
+        masks: valid pixels ``(H, W)`` bool of these views as taken; ``None`` for all.
     """
 
     left: np.ndarray
@@ -60,6 +62,7 @@ class PairInputs:
     undistorted: bool = False
     prior_map: np.ndarray | None = None
     cameras: tuple[Camera, ...] = ()
+    masks: Sequence[Tensor | None] = ()
 
 
 @dataclass(frozen=True)

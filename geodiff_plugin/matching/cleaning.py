@@ -91,17 +91,39 @@ def _transformed(blocks: Tensor, basis: Tensor) -> Tensor:
     return (basis @ (blocks.reshape(-1, _BLOCK) @ basis.T).view(len(blocks), _BLOCK, -1)).view(blocks.shape)
 
 
-def _steps_at_edges(levels: Tensor, axis: int) -> Tensor:
-    """Average the step to the pixel below (axis 0) or to the right (1), by position modulo 8, ``(N, 8)``."""
-    steps = levels.diff(dim=axis + 1).abs().clamp_max(_MAX_BLOCK_EDGE).mean(2 - axis)
-    return steps[:, : steps.shape[1] // _BLOCK * _BLOCK].view(len(levels), -1, _BLOCK).mean(1)
+def _steps_at_edges(levels: Tensor, axis: int, valid: Tensor | None) -> Tensor:
+    """Average the step to the pixel below (axis 0) or to the right (1), by position modulo 8, ``(N, 8)``.
+
+    Only steps between two pixels that are ``valid (1, H, W)`` bool count; ``None`` for all.
+    """
+    steps = levels.diff(dim=axis + 1).abs().clamp_max(_MAX_BLOCK_EDGE)
+    if valid is None:
+        return _by_position(steps.mean(2 - axis)).mean(1)
+    length = valid.shape[axis + 1] - 1
+    known = valid.narrow(axis + 1, 0, length) & valid.narrow(axis + 1, 1, length)
+    total, count = (_by_position(each.sum(2 - axis)).sum(1) for each in (steps * known, known))
+    return total / count.clamp_min(1)
 
 
-def _noise_energy(levels: Tensor) -> Tensor:
-    """Compute the energy ``(N, 1)`` of the finest coefficients of the flattest blocks."""
-    rows, columns = (side // _BLOCK for side in levels.shape[1:])
-    whole = levels[:, : rows * _BLOCK, : columns * _BLOCK].reshape(-1, rows, _BLOCK, columns, _BLOCK)
-    blocks = whole.transpose(2, 3).reshape(len(levels), rows * columns, -1)
+def _by_position(lines: Tensor) -> Tensor:
+    """Reshape values of rows or columns ``(N, n)`` to ``(N, n // 8, 8)``."""
+    return lines[:, : lines.shape[1] // _BLOCK * _BLOCK].view(len(lines), -1, _BLOCK)
+
+
+def _whole_blocks(images: Tensor) -> Tensor:
+    """Return the pixels ``(N, n, 64)`` of all blocks of images ``(N, H, W)``."""
+    rows, columns = (side // _BLOCK for side in images.shape[1:])
+    whole = images[:, : rows * _BLOCK, : columns * _BLOCK].reshape(-1, rows, _BLOCK, columns, _BLOCK)
+    return whole.transpose(2, 3).reshape(len(images), rows * columns, -1)
+
+
+def _noise_energy(levels: Tensor, valid: Tensor | None) -> Tensor:
+    """Compute the energy ``(N, 1)`` of the finest coefficients of the flattest blocks of valid pixels."""
+    blocks = _whole_blocks(levels)
+    if valid is not None:
+        blocks = blocks[:, _whole_blocks(valid)[0].all(-1)]
+    if not blocks.shape[1]:
+        return levels.new_zeros(len(levels), 1)
     fine = blocks @ to_device_of(levels, _coefficients(_FINE))
     energy = fine.square().mean(-1).sort(dim=1).values
     at = _FLATTEST * (energy.shape[1] - 1)
@@ -116,27 +138,29 @@ class Flaws(NamedTuple):
     noise: float  # standard deviation, levels of 255
 
 
-def find_flaws(levels: Tensor) -> list[Flaws]:
+def find_flaws(levels: Tensor, valid: Tensor | None = None) -> list[Flaws]:
     """Measure compression and noise of images ``(N, H, W)``, grey levels up to 255.
 
-    The scale is 0 if no trace of compression remains, as after resampling. Synchronizes with the device
-    twice.
+    The scale is 0 if no trace of compression remains, as after resampling. Only blocks of ``valid (1, H, W)``
+    bool pixels of a single image count, because other pixels are smooth; ``None`` for all. Synchronizes with
+    the device twice.
     """
-    found = torch.cat([*(_steps_at_edges(levels, axis) for axis in (0, 1)), _noise_energy(levels)], dim=1)
+    steps = [_steps_at_edges(levels, axis, valid) for axis in (0, 1)]
+    found = torch.cat([*steps, _noise_energy(levels, valid)], dim=1)
     numbers = found.cpu().numpy()
     # Offset of the block grid, 0 to 7, which depends on how the image was cropped.
     begins = [(numbers[:, at : at + _BLOCK].argmax(1) + 1) % _BLOCK for at in (0, _BLOCK)]
-    scales = _jpeg_scales(levels, np.stack(begins, axis=1))
+    scales = _jpeg_scales(levels, np.stack(begins, axis=1), valid)
     noises = np.sqrt(numbers[:, -1]) * _NOISE_OF_FLATTEST
     return [Flaws(scale, float(noise)) for scale, noise in zip(scales, noises, strict=True)]
 
 
-def _jpeg_scales(levels: Tensor, begins: np.ndarray) -> list[float]:
+def _jpeg_scales(levels: Tensor, begins: np.ndarray, valid: Tensor | None = None) -> list[float]:
     """Return ``Flaws.jpeg_scale`` of every image, with blocks offset by ``begins (N, 2)``, row and column.
 
     For each of some coefficients the largest step is chosen of which its values are multiples.
     """
-    blocks = _some_blocks(levels, begins)
+    blocks = _some_blocks(levels, begins, valid)
     value = (blocks @ to_device_of(levels, _coefficients(_KEPT))).abs()[..., None]  # (N, n, kept, 1)
     step = np.arange(2, _MAX_STEP, dtype=np.float32)
     least, waves = to_device_of(levels, np.stack([0.6 * step, 2 * math.pi / step]).astype(np.float32))
@@ -148,12 +172,19 @@ def _jpeg_scales(levels: Tensor, begins: np.ndarray) -> list[float]:
     return [_scale(of_image) for of_image in largest / [_LUMA_STEPS[_BLOCK * i + j] for i, j in _KEPT]]
 
 
-def _some_blocks(levels: Tensor, begins: np.ndarray) -> Tensor:
+def _some_blocks(levels: Tensor, begins: np.ndarray, valid: Tensor | None = None) -> Tensor:
     """Return the pixels ``(N, n, 64)`` of at most ``_MAX_BLOCKS`` blocks; 0 if an image has fewer."""
     rows, columns = ((np.array(levels.shape[1:]) - begins) // _BLOCK).T[..., None]
-    every = np.maximum(1, -(-rows * columns // _MAX_BLOCKS))
-    block = np.arange((-(-rows * columns // every)).max()) * every
-    exists = block < rows * columns
+    number = rows * columns
+    if valid is not None:
+        (row, column), *_ = begins.tolist()
+        whole = np.flatnonzero(_whole_blocks(valid[:, row:, column:])[0].all(-1).cpu().numpy())
+        number = np.array([[len(whole)]])
+    every = np.maximum(1, -(-number // _MAX_BLOCKS))
+    block = np.arange((-(-number // every)).max()) * every
+    exists = block < number
+    if valid is not None:
+        block = whole[block]
     row, column = (begins[:, axis, None] + _BLOCK * at for axis, at in enumerate(np.divmod(block, columns)))
     table = np.stack([np.where(exists, row, 0), np.where(exists, column, 0), exists])
     row_at, column_at, there = to_device_of(levels, table)
@@ -184,22 +215,28 @@ def _threshold(flaws: Flaws) -> np.ndarray | None:
 
 
 @torch.no_grad()
-def clean(images: Sequence[Tensor], grid_pixels: int) -> list[Tensor]:
+def clean(
+    images: Sequence[Tensor], grid_pixels: int, masks: Sequence[Tensor | None] | None = None
+) -> list[Tensor]:
     """Remove compression blocks and sensor noise from images ``(3, H, W)``, or grey ones.
 
     Block edges are at the same columns of both images, so that weak texture would match at shifts of 8
     pixels; noise hides it. Images without flaws, or with more than six times ``grid_pixels``, the pixels of
-    the matching grid, are returned unchanged. Images of one size are analysed together.
+    the matching grid, are returned unchanged. Images of one size are analysed together, those with ``masks``
+    of valid pixels ``(H, W)`` bool alone.
     """
     cleaned = list(images)
     most = _MAX_PIXEL_RATIO * grid_pixels
-    by_shape = defaultdict[torch.Size, list[int]](list)
+    together = defaultdict[tuple[torch.Size, int | None], list[int]](list)
     for number, image in enumerate(images):
         if image.shape[-2] * image.shape[-1] <= most:
-            by_shape[image.shape].append(number)
-    for of_size in by_shape.values():
-        levels = grey(torch.stack([images[number] for number in of_size]))[:, 0] * 255.0
-        for number, of_image, flaws in zip(of_size, levels, find_flaws(levels), strict=True):
+            alone = number if masks is not None and masks[number] is not None else None
+            together[image.shape, alone].append(number)
+    for (_, alone), numbers in together.items():
+        mask = None if masks is None or alone is None else masks[alone]
+        levels = grey(torch.stack([images[number] for number in numbers]))[:, 0] * 255.0
+        all_flaws = find_flaws(levels, None if mask is None else mask[None].to(levels.device))
+        for number, of_image, flaws in zip(numbers, levels, all_flaws, strict=True):
             threshold = _threshold(flaws)
             if threshold is not None:
                 change = (_without(of_image, threshold) - of_image) / 255.0

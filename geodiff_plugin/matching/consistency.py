@@ -106,7 +106,7 @@ def window_mean(maps: Tensor, radius: int) -> Tensor:
 
 def _in_window(size: int, radius: int) -> Tensor:
     """Count the positions of an axis within ``radius`` of each one, ``(size,)``."""
-    at = torch.arange(size)
+    at = torch.arange(size, device="cpu")
     return (at + radius).clamp_max(size - 1) - (at - radius).clamp_min(0) + 1
 
 
@@ -116,7 +116,7 @@ def _sums(values: Tensor, length: int, axis: int) -> Tensor:
     ``avg_pool2d`` takes ``length`` steps, on one thread without vector instructions.
     """
     count = values.shape[axis] - length + 1
-    total = torch.zeros(())
+    total = values.new_zeros(())
     start, block = 0, 1  # ``values`` are sums of ``block`` consecutive ones
     while True:
         if length & block:

@@ -17,7 +17,7 @@ from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.algorithm.edges import sharpen_edges
 from geodiff_plugin.algorithm.match_fitting import fit_depth, fit_target, local_error
 from geodiff_plugin.algorithm.member import Member
-from geodiff_plugin.cameras import Camera
+from geodiff_plugin.cameras import Camera, resized_mask
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import image_size
@@ -89,7 +89,7 @@ class ImageResult:
     confidence: Tensor | None = None  # [0, 1]
     support: Tensor | None = None  # [0, 1]
     prior_error: Tensor | None = None  # (1, 1, 1, 1), or per pixel, log depth
-    over_prior: Tensor | None = None  # (E, h w) ratio of the depth to a metric prior's depth
+    over_prior: Tensor | None = None  # (E, h w) ratio to a metric prior's depth, NaN where not valid
     measurable_m: Tensor | None = None  # (1,) metres, farthest measurable depth
 
 
@@ -144,9 +144,8 @@ def finish(
     maps = _refined(maps, evidence, members, left.image_01[None], options)
     visible, error = reprojection(native.rights, maps.depth_m, left) if native.rights else (None, None)
     relative = median(cat_samples([member.relative for member in members]), 0)[None]
-    checked = _CheckedMaps(
-        maps, relative, visible, over_prior=_over_prior(members, maps.depth_m), prior_error=_error_of(members)
-    )
+    over_prior = _over_prior(members, maps.depth_m, left.valid)
+    checked = _CheckedMaps(maps, relative, visible, over_prior=over_prior, prior_error=_error_of(members))
     stage = _stage(evidence, members, checked, options)
     verdict = judge(evidence.facts.of_call(options.call) | measure_result(stage))
     if maps.confidence is not None:
@@ -356,13 +355,19 @@ def _spread_of_members(
     return spread_around(depth_m, torch.cat(refined_m), options.reduction)
 
 
-def _over_prior(members: Sequence[Member], depth_m: Tensor) -> Tensor | None:
-    """Compute the ratio ``(E, h w)`` of a map to a metric prior's own depth, on the prior's grid."""
+def _over_prior(members: Sequence[Member], depth_m: Tensor, valid: Tensor | None) -> Tensor | None:
+    """Compute the ratio ``(E, h w)`` of a map to a metric prior's own depth, on the prior's grid.
+
+    NaN where pixels are not ``valid (H, W)`` bool, since nothing but the prior gives a depth there.
+    """
     priors_m = [member.prior_depth_m for member in members if member.prior_depth_m is not None]
     if len(priors_m) < len(members):
         return None
     resized = F.interpolate(depth_m, priors_m[0].shape[-2:], mode="bilinear", align_corners=False)
-    return (resized / cat_samples(priors_m).clamp_min(MIN_DEPTH_M)).flatten(1)
+    ratio = resized / cat_samples(priors_m).clamp_min(MIN_DEPTH_M)
+    if valid is not None and bool((inside := resized_mask(valid, image_size(ratio))).any()):
+        ratio = torch.where(inside, ratio, torch.nan)
+    return ratio.flatten(1)
 
 
 def _stage(

@@ -278,7 +278,7 @@ def _numbers(results: Sequence[ImageResult], over_prior: Tensor | None) -> dict[
     names = ("scale", "shift", "global_scale")
     numbers = {name: torch.stack([getattr(result, name) for result in results]) for name in names}
     if over_prior is not None:
-        numbers["prior_scale"] = over_prior.median(1).values.view(len(results), -1)
+        numbers["prior_scale"] = over_prior.nanmedian(1).values.view(len(results), -1)
     errors = [result.prior_error for result in results if result.prior_error is not None]
     if len(errors) == len(results):  # of some images one number, of others a map
         numbers["prior_error"] = cat_samples([error.amin((1, 2, 3)) for error in errors])
@@ -308,8 +308,8 @@ def to_host(*groups: Mapping[str, Tensor | None]) -> list[dict[str, Any]]:
 
 def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> MetricDepthOutput:
     """Convert an output without a unit to the metres of a metric prior."""
-    factor = 1.0 / float(over_prior.median())
-    spread = SD_PER_MAD * float((over_prior * factor).clamp_min(1e-9).log().abs().median())
+    factor = 1.0 / float(over_prior.nanmedian())
+    spread = SD_PER_MAD * float((over_prior * factor).clamp_min(1e-9).log().abs().nanmedian())
 
     def rescale(E: np.ndarray) -> np.ndarray:
         return np.block([[E[:3, :3], factor * E[:3, 3:]], [E[3:]]])

@@ -7,7 +7,7 @@ warps, and the facts of its checks, so that their verdicts state the same reason
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.pose_check import CheckedPoses
 from geodiff_plugin.evidence.prepare import cleaned, pinhole
-from geodiff_plugin.evidence.valid import BLEND_PX, as_mask, content_mask, filled_by_undistortion
+from geodiff_plugin.evidence.valid import BLEND_PX, RIM_PX, as_mask, outside_borders, undistorted_mask
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.runtime.prefetch import prefetch_evidence
 from geodiff_plugin.streaming.sources import StereoFrame
@@ -37,6 +37,7 @@ class RigSetup(NamedTuple):
 
     cameras: tuple[Camera, Camera]
     guidance: GeometryGuidance
+    masks: Sequence[Tensor | None] = (None, None)  # (H, W) bool, valid pixels with distortion; None for all
 
 
 #: Makes the setup of a rig from the left and right image of its first frame, ``(H, W, 3)`` float32 in [0, 1].
@@ -53,28 +54,35 @@ def setup_of_rig(rig: Rig, config: GuidanceConfig, mask: Any = None, right_mask:
         check_calibrated_size(left_size, rig.size_left, "the left frame", rig.source, hint)
         check_calibrated_size(right_size, rig.size_right, "the right frame", rig.source, hint)
         sized = rig.sized(left_size, right_size)
-        left_view = (pinhole(left, sized.left, config), rig.K_left, np.eye(4))
-        right_view = (pinhole(right, sized.right, config), rig.K_right, rig.E)
+        cameras, masks = (sized.left, sized.right), _bent_masks(sized, left, right)
+        left_view = (pinhole(left, sized.left, config, masks[0]), rig.K_left, np.eye(4))
+        right_view = (pinhole(right, sized.right, config, masks[1]), rig.K_right, rig.E)
+        seen_left, seen_right = (
+            None if camera.lens is None else undistorted_mask(valid, camera, image.shape[:2])
+            for valid, camera, image in zip(masks, cameras, (left, right), strict=True)
+        )
         guidance = GeometryGuidance.from_views(
             [left_view, right_view],
-            mask=_seen(sized.left) if mask is None else mask,
-            right_mask=_seen(sized.right) if right_mask is None else right_mask,
+            mask=seen_left if mask is None else mask,
+            right_mask=seen_right if right_mask is None else right_mask,
             unit=rig.unit,
             measured_baseline=rig.measured,
             config=config,
         )
         guidance.calibrated = True
-        return RigSetup((sized.left, sized.right), guidance)
+        return RigSetup(cameras, guidance, masks)
 
     return setup
 
 
-def _seen(camera: Camera) -> np.ndarray | None:
-    """Return the pixels ``(H, W)`` bool that undistortion fills; ``None`` without distortion."""
-    if camera.lens is None or camera.size is None:
-        return None
-    width, height = camera.size
-    return filled_by_undistortion(np.ones((height, width), bool), camera)
+def _bent_masks(rig: Rig, left: np.ndarray, right: np.ndarray) -> list[Tensor | None]:
+    """Return the pixels ``(H, W)`` bool inside of borders of images ``(H, W, 3)`` with lens distortion.
+
+    ``None`` stands for all pixels. Borders of images without distortion are found with each check.
+    """
+    if rig.left.lens is None and rig.right.lens is None:
+        return [None, None]
+    return outside_borders([as_image_01(image, "frame") for image in (left, right)], [None, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +133,8 @@ class LiveRig:
         checks = bool(self._check_every) and self._count % self._check_every == 0
         with captured_warnings() as warned:
             setup = self._setup = self._setup or self._make(*map(_as_01, (frame.left, frame.right)))
-            pairs = zip((frame.left, frame.right), setup.cameras, strict=True)
-            left, right = (_straight(image, camera, setup.guidance.config) for image, camera in pairs)
+            views = zip((frame.left, frame.right), setup.cameras, setup.masks, strict=True)
+            left, right = (_straight(*view, setup.guidance.config) for view in views)
             if checks or self._count == 0:
                 self._check_images(setup.guidance, left, right)
             guidance = setup.guidance.for_frame(right, *self._masks)
@@ -142,11 +150,12 @@ class LiveRig:
         return PreparedFrame(frame, left, guidance, checks)
 
     def _check_images(self, guidance: GeometryGuidance, left: np.ndarray, right: np.ndarray) -> None:
-        """Find black borders, and whether the images of this rig need cleaning."""
+        """Find constant borders, and whether the images of this rig need cleaning."""
         self._masks = _valid_pixels(guidance, left, right)
         config = guidance.config
         images = [as_image_01(image, "frame") for image in (left, right)]
-        clean = all(one is other for one, other in zip(images, cleaned(images, config), strict=True))
+        clear = cleaned(images, self._masks, config)
+        clean = all(one is other for one, other in zip(images, clear, strict=True))
         pose = "refine" if self._check_every else "given"
         self._config = config.changed(pose=pose, clean_images=config.clean_images and not clean)
 
@@ -162,23 +171,23 @@ def _as_01(image: np.ndarray) -> np.ndarray:
     return image_01
 
 
-def _straight(image: np.ndarray, camera: Camera, config: GuidanceConfig) -> np.ndarray:
+def _straight(image: np.ndarray, camera: Camera, valid: Tensor | None, config: GuidanceConfig) -> np.ndarray:
     """Return an image without lens distortion; the same object if there is none."""
-    return image if camera.lens is None else pinhole(_as_01(image), camera, config)
+    return image if camera.lens is None else pinhole(_as_01(image), camera, config, valid)
 
 
 def _valid_pixels(
     guidance: GeometryGuidance, left: np.ndarray, right: np.ndarray
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return the valid pixels ``(H, W)`` of both views: the masks of the rig, or all but black borders."""
+    """Return the valid pixels ``(H, W)`` of both views: the masks of the rig, or all but constant borders.
+
+    The blended edge of a border is left out too, because these pixels are used for all frames.
+    """
     (given,) = guidance.inputs
     known = (as_mask(given.mask, "mask", left.shape[:2]), given.views[0].valid)
-    pairs = zip(known, (left, right), strict=True)
-    of_left, of_right = (_inside_borders(image) if mask is None else mask for mask, image in pairs)
+    found = outside_borders([as_image_01(image, "frame") for image in (left, right)], known)
+    of_left, of_right = (
+        mask if mask is None or mask is own else eroded(mask, BLEND_PX - RIM_PX)
+        for mask, own in zip(found, known, strict=True)
+    )
     return of_left, of_right
-
-
-def _inside_borders(image: np.ndarray) -> Tensor | None:
-    """Return the pixels inside of black borders, without their blended edge, which is used for all frames."""
-    valid = content_mask(as_image_01(image, "frame"))
-    return None if valid is None else eroded(valid, BLEND_PX)

@@ -52,7 +52,7 @@ class Defocus(Check[Sharpness]):
 
     @classmethod
     def of_images(cls, stage: ImagesStage) -> Sharpness | None:
-        left, *rights = map(log_detail_ratio, stage.greys)
+        left, *rights = map(log_detail_ratio, stage.greys, stage.masks)
         differences = {
             view: left - right for view, right in enumerate(rights) if left is not None and right is not None
         }
@@ -76,14 +76,19 @@ class Defocus(Check[Sharpness]):
         )
 
 
-def log_detail_ratio(grey: np.ndarray) -> float | None:
+def log_detail_ratio(grey: np.ndarray, valid: np.ndarray | None = None) -> float | None:
     """Return the log ratio of mean fine to mean coarse detail of a grey image ``(H, W)`` uint8.
 
-    Both are absolute differences of Gaussians. Returns ``None`` if the image has too little texture.
+    Both are absolute differences of Gaussians, at ``valid (H, W)`` bool pixels; ``None`` for all. Returns
+    ``None`` if the image has too little texture.
     """
     levels = grey.astype(np.float32)
     fine, middle, coarse = (cv2.GaussianBlur(levels, (0, 0), px) for px in (FINE_PX, MIDDLE_PX, COARSE_PX))
     fine_detail, coarse_detail = np.abs(fine - middle), np.abs(middle - coarse)
+    if valid is not None:
+        fine_detail, coarse_detail = fine_detail[valid], coarse_detail[valid]
+    if coarse_detail.size < MIN_PIXELS:
+        return None
     textured = coarse_detail >= max(float(np.quantile(coarse_detail, TEXTURED)), MIN_DETAIL)
     if textured.sum() < MIN_PIXELS:
         return None

@@ -55,7 +55,7 @@ class PriorScale(Check[Ratio]):
     def scalars(cls, stage: ResultStage) -> dict[str, Tensor]:
         if stage.over_prior is None or not stage.call.has_unit:
             return {}
-        return {"ratio": stage.over_prior.median()}
+        return {"ratio": stage.over_prior.nanmedian()}
 
     @classmethod
     def of_result(cls, stage: ResultStage, numbers: Mapping[str, float]) -> Ratio | None:

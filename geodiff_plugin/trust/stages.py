@@ -41,6 +41,11 @@ class ImagesStage(NamedTuple):
     valid: Sequence[np.ndarray | None] = ()  # (H, W) bool, valid pixels of each image; None or empty for all
 
     @property
+    def masks(self) -> Sequence[np.ndarray | None]:
+        """``valid`` with an entry for each image."""
+        return self.valid or [None] * len(self.greys)
+
+    @property
     def has_rectangles(self) -> bool:
         """Whether the valid pixels of every image form a rectangle."""
         masks = [mask for mask in self.valid if mask is not None]
@@ -49,8 +54,7 @@ class ImagesStage(NamedTuple):
     @property
     def in_black(self) -> list[np.ndarray]:
         """The images with black in place of pixels that are not valid."""
-        masks = self.valid or [None] * len(self.greys)
-        pairs = zip(self.greys, masks, strict=True)
+        pairs = zip(self.greys, self.masks, strict=True)
         return [grey if mask is None else np.where(mask, grey, np.uint8(0)) for grey, mask in pairs]
 
 
@@ -122,7 +126,7 @@ class ResultStage:
     rank_correlation: Tensor | None = None  # (), rank correlation of the prior's first map with the evidence
     prior_error: Tensor | None = None  # (), error of the prior's map, log depth
     on_edge: Tensor | None = None  # (), whether the scale search ended at the edge of its range
-    over_prior: Tensor | None = None  # (E, N) ratio of the depth to a metric prior's depth
+    over_prior: Tensor | None = None  # (E, N) ratio to a metric prior's depth, NaN where not valid
 
     def mean(self, values: Tensor) -> Tensor:
         """Mean ``()`` of a map ``(1, 1, H, W)`` on any grid over the valid pixels of the left image."""

@@ -1,16 +1,35 @@
 """Run the command line inside the test's process, and write a small pair for it to read."""
 
 import json
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import torch
 from PIL import Image
 
 from geodiff_plugin.cli.app import main
+from geodiff_plugin.jobs.prior import load_quiet_prior
 
 #: One update of one step: for tests of everything but the depth.
 QUICK = ["--steps", "1", "--preset", "paper", "--device", "cpu"]
+
+
+@cache
+def loaded(name: str, device: torch.device) -> Any:
+    return load_quiet_prior(name, device)
+
+
+@pytest.fixture
+def one_prior(monkeypatch):
+    """The prior is loaded once for all cases."""
+
+    def load(name, device, *_):
+        return loaded(name, device)
+
+    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_quiet_prior", load)
 
 
 def never(*_, **__):

@@ -146,3 +146,24 @@ def test_it_is_where_opencv_puts_it(pair_files, geodiff, tmp_path):
     (u, v) = cv2.projectPoints(point[None], np.zeros(3), np.zeros(3), np.array(K_TO), None)[0][0, 0]
     around = seen_m[int(v) : int(v) + 2, int(u) : int(u) + 2]
     assert around.min() * 0.98 < point[2] < around.max() * 1.02
+
+
+@pytest.mark.parametrize("fill", [False, True])
+def test_masked_pixels_are_in_no_file_unless_they_are_filled(pair_files, geodiff, tmp_path, fill):
+    trimesh = pytest.importorskip("trimesh")
+    height, width = np.asarray(Image.open(pair_files.left)).shape[:2]
+    valid = np.arange(width)[None].repeat(height, 0) >= 20
+    for name, mask in (("l.png", valid), ("r.png", valid | (np.arange(height) > 40)[:, None])):
+        Image.fromarray(mask.astype(np.uint8) * 255).save(tmp_path / name)
+    words = [*pair_files.command, *QUICK, "--mask", "l.png", "--right-mask", "r.png", "--export", "mesh"]
+    words += ["--reproject", camera_file(tmp_path), *(["--fill"] if fill else []), "--out", "o", "-q"]
+    answer = geodiff(*words)
+    assert answer.code == 0, answer.err
+    depth_m = np.load("o/depth.npy")
+    assert (depth_m[valid] > 0).all() and (depth_m[~valid] > 0).all() == fill == (depth_m[~valid] > 0).any()
+    K = np.reshape(report_of("o")["K"], (3, 3))
+    seen_m, expected_m = np.load("o/depth_reprojected.npy"), expected_of(tmp_path / "o")
+    np.testing.assert_array_equal(seen_m, expected_m)
+    points = np.asarray(trimesh.load("o/mesh.glb", force="mesh").vertices)
+    column = K[0, 0] * points[:, 0] / np.abs(points[:, 2]) + K[0, 2]
+    assert (column < 19).any() == fill

@@ -3,16 +3,11 @@
 import json
 import re
 import shlex
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
-
-from geodiff_plugin.jobs.prior import load_quiet_prior
 
 INPUTS = Path(__file__).resolve().parents[3] / "shared" / "data" / "inputs"
 TRUTH = INPUTS / "_truth"
@@ -73,21 +68,6 @@ def depth_of_bag(path: Path) -> np.ndarray:
         connection, _, raw = next(reader.messages(images))
         message = reader.deserialize(raw, connection.msgtype)
     return message.data.view("<u2").reshape(message.height, message.width) / 1000
-
-
-@cache
-def loaded(name: str, device: torch.device) -> Any:
-    return load_quiet_prior(name, device)
-
-
-@pytest.fixture
-def one_prior(monkeypatch):
-    """The prior is loaded once for all cases."""
-
-    def load(name, device, *_):
-        return loaded(name, device)
-
-    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_quiet_prior", load)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -41,11 +41,19 @@ def image(pixels: np.ndarray, ns: int = 0):
     return sent(image_message(STORE.types, header(ns), pixels, "rgb8"))
 
 
-def info(K: np.ndarray, size: tuple[int, int], baseline_m: float = 0.0, D: tuple[float, ...] = (0.0,) * 5):
+def info(
+    K: np.ndarray,
+    size: tuple[int, int],
+    baseline_m: float = 0.0,
+    D: tuple[float, ...] = (0.0,) * 5,
+    binning: int = 0,
+):
     roi = STORE.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     P = np.column_stack([K, (-K[0, 0] * baseline_m, 0.0, 0.0)])
     matrices = [np.asarray(m, float).ravel() for m in (D, K, np.eye(3), P)]
-    return sent(STORE.types[CAMERA_INFO](header(0), size[1], size[0], "plumb_bob", *matrices, 0, 0, roi))
+    return sent(
+        STORE.types[CAMERA_INFO](header(0), size[1], size[0], "plumb_bob", *matrices, *[binning] * 2, roi)
+    )
 
 
 @pytest.fixture
@@ -62,7 +70,22 @@ def source(frames, textured_plane):
     source, size = frames.MessageSource(), textured_plane.left.shape[1::-1]
     source.camera_info("left", info(textured_plane.K, size))
     source.camera_info("right", info(textured_plane.K, size, BASELINE_M))
+    source.images(image(textured_plane.left), image(textured_plane.right))
     return source
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_the_size_of_the_images_shows_whether_k_is_binned(frames, textured_plane, factor):
+    """A driver states K and size of the sensor, or those of the binned images along with the binning."""
+    source, (width, height) = frames.MessageSource(), textured_plane.left.shape[1::-1]
+    K = np.diag([factor, factor, 1]) @ textured_plane.K
+    for side, baseline_m in (("left", 0.0), ("right", BASELINE_M)):
+        size = (factor * width, factor * height)
+        source.camera_info(side, info(K, size, baseline_m, binning=2))
+    source.images(image(textured_plane.left), image(textured_plane.right))
+    rig = source.rig(rectified=True)
+    np.testing.assert_allclose(rig.K_left, textured_plane.K)
+    assert rig.size_left == (width, height)
 
 
 def test_the_rig_is_that_of_both_cameras(source, textured_plane):
@@ -76,6 +99,7 @@ def test_raw_images_have_a_lens(frames, textured_plane):
     source, size = frames.MessageSource(), textured_plane.left.shape[1::-1]
     for side, baseline_m in (("left", 0.0), ("right", BASELINE_M)):
         source.camera_info(side, info(textured_plane.K, size, baseline_m, (-0.2, 0.05, 0.0, 0.0, 0.0)))
+    source.images(image(textured_plane.left), image(textured_plane.right))
     rig = source.rig(rectified=False)
     np.testing.assert_allclose(rig.left.lens.coefficients[:2], (-0.2, 0.05))
     assert source.rig(rectified=True).left.lens is None
@@ -85,6 +109,7 @@ def test_cameras_that_are_no_pair(frames, textured_plane):
     source = frames.MessageSource()
     for side in ("left", "right"):
         source.camera_info(side, info(textured_plane.K, (64, 48)))
+    source.images(image(textured_plane.left), image(textured_plane.right))
     with pytest.raises(InputError, match="projection_matrix"):
         source.rig(rectified=True)
 
@@ -251,6 +276,7 @@ def test_the_node_logs_why_it_cannot_go_on(node, textured_plane):
     made = node.DepthNode()
     for side in ("left", "right"):
         made.subscribed[f"{side}/camera_info"](info(textured_plane.K, (64, 48)))
+    made._pairs.callback(image(textured_plane.left), image(textured_plane.right))
     made._thread.join(120)
     assert "projection_matrix" in made.logged[0]
     made.destroy_node()

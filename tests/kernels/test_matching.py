@@ -13,6 +13,7 @@ from geodiff_plugin.matching.aggregation import jump_penalties
 from geodiff_plugin.matching.census import COST_LEVELS, grey
 from geodiff_plugin.matching.constants import NEVER
 from geodiff_plugin.matching.winner import winner, winner_positions
+from geodiff_plugin.result.confidence import reprojection
 from tests.kernels.drawn import drawn
 from tests.tiny import render_plane
 from tests.views import posed_of
@@ -191,3 +192,51 @@ def test_few_planes_have_no_runner_up(device):
     levels, in_view, grey = random_volume((3, 4, 5), 2, device)
     levels[1] = 0
     assert (winner(aggregate(levels, grey), levels, in_view).second_best == NEVER).all()
+
+
+def with_holes(posed: PosedViews, seed: int, right_only: bool = False) -> PosedViews:
+    """Views whose left and right pixels are invalid in blocks and in a border."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def masked(view):
+        height, width = view.size
+        blocks = torch.rand(-(-height // 3), -(-width // 3), generator=generator) > 0.2
+        valid = blocks.repeat_interleave(3, 0).repeat_interleave(3, 1)[:height, :width].contiguous()
+        valid[:, :2] = False
+        return view._replace(valid=valid.to(view.image_01.device))
+
+    left = posed.left if right_only else masked(posed.left)
+    return PosedViews(left, tuple(masked(view) for view in posed.rights))
+
+
+@pytest.mark.parametrize(("names", "right_only"), [(("rectified",), True), (("rectified", "turned"), False)])
+def test_a_sweep_and_matches_of_masked_views_equal_their_reference(device, names, right_only):
+    plain = views_of(names, (11, 16), device)
+    posed, planes = with_holes(plain, 2, right_only), torch.linspace(0.0, 1.1, 7)
+    found = sweep_planes(posed, planes)
+    with without_kernels():
+        expected, unmasked = sweep_planes(posed, planes), sweep_planes(plain, planes)
+    assert torch.equal(found.in_view, expected.in_view) and torch.equal(found.levels, expected.levels)
+    assert found.in_view.sum() < unmasked.in_view.sum()
+    assert posed.left.valid is None or not found.in_view[:, ~posed.left.valid].any()
+    matches = match_volume(found)
+    with without_kernels():
+        reference = match_volume(expected)
+    torch.testing.assert_close(matches.inverse_depth, reference.inverse_depth, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(matches.confidence, reference.confidence, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(matches.deviation, reference.deviation, rtol=1e-5, atol=1e-5)
+
+
+def test_the_reprojection_of_masked_views_equals_its_reference(device):
+    posed = with_holes(views_of(("rectified", "turned"), (20, 28), device), 3)
+    left, *rights = (
+        view._replace(image_01=view.image_01.expand(3, -1, -1).contiguous())
+        for view in (posed.left, *posed.rights)
+    )
+    depth_m = 2.0 + 0.3 * torch.rand(1, 1, *left.size, generator=torch.Generator().manual_seed(0))
+    visible, error = reprojection(rights, depth_m.to(device), left)
+    with without_kernels():
+        expected_visible, expected_error = reprojection(rights, depth_m.to(device), left)
+    assert (visible != expected_visible).float().mean() <= 4e-3 and not visible[0, 0, ~left.valid].any()
+    both = visible & expected_visible
+    assert both.any() and ((error - expected_error).abs()[both] > 1e-3).float().mean() <= 1e-2

@@ -10,6 +10,7 @@ import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -30,7 +31,9 @@ from geodiff_plugin.app.job import (
 )
 from geodiff_plugin.app.lenses import LENSES
 from geodiff_plugin.app.messages import PageError
+from geodiff_plugin.app.results import HATCH_LEVEL, map_image
 from geodiff_plugin.app.sessions import Stopped
+from geodiff_plugin.app.shown import shown_of
 from geodiff_plugin.jobs.options import DepthOptions
 
 LENS = {"fx": 60.0, "fy": 61.0, "cx": 31.0, "cy": 22.0}
@@ -403,3 +406,30 @@ def test_an_image_that_is_far_too_large_is_rejected_by_its_head(tmp_path):
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
     with pytest.raises(PageError, match="The left image is too large. This page takes images of at most 16"):
         image_size(str(path), "the left image")
+
+
+@pytest.mark.end_to_end
+@pytest.mark.filterwarnings("ignore")
+def test_transparent_pixels_of_an_upload_get_no_depth_and_are_hatched(
+    pipe, textured_plane, monkeypatch, tmp_path
+):
+    valid = np.ones(textured_plane.left.shape[:2], bool)
+    valid[:, :20] = False
+    alpha = np.where(valid, 255, 0).astype(np.uint8)
+    paths = []
+    for name in ("left", "right"):
+        paths.append(str(tmp_path / f"{name}.png"))
+        Image.fromarray(np.dstack([getattr(textured_plane, name), alpha])).save(paths[-1])
+    (fx, _, cx), (_, fy, cy), _ = textured_plane.K.tolist()
+    lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    fields = CameraFields("numbers", lens=lens, baseline=float(textured_plane.E[0, 3]))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    request = request_of(*paths, fields, steps=1)
+    run = run_job(request, SimpleNamespace(get=lambda _: pipe), threading.Event(), lambda *_: None)
+    assert not run.output.valid[0, ..., 0][~valid].any() and run.output.valid[0, ..., 0][valid].all()
+    write_job(run)
+    shown = shown_of(run, "pair")
+    assert (shown.depth_m > 0).tolist() == valid.tolist()
+    image = map_image(shown, "depth")
+    lines = (image == HATCH_LEVEL).all(-1)
+    assert lines[~valid].mean() > 0.2 and not lines[valid].any()

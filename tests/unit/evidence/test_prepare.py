@@ -9,7 +9,7 @@ import torch
 
 from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin._internal.threads import BackgroundTask
-from geodiff_plugin.cameras import Camera, PosedViews, View
+from geodiff_plugin.cameras import Camera, PosedViews, View, eroded
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence import plan as plan_module
 from geodiff_plugin.evidence import prepare as module
@@ -17,7 +17,7 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.evidence.plan import CheckedRows, EvidencePlan
 from geodiff_plugin.evidence.pose_check import CheckedPoses
-from geodiff_plugin.evidence.prepare import cleaned, plan_evidence, prepare_evidence
+from geodiff_plugin.evidence.prepare import BLEND_PX, cleaned, plan_evidence, prepare_evidence
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.trust import FactSheet, MatchesStage
 from geodiff_plugin.trust.field_of_view import FieldOfView, ViewAngle
@@ -53,15 +53,27 @@ def same_views(found: PosedViews, views, left=LEFT) -> bool:
 
 def test_images_are_cleaned_to_the_pixels_of_the_sweep_if_that_is_set(monkeypatch):
     asked = []
-    monkeypatch.setattr(module, "clean", lambda images, pixels: asked.append((images, pixels)) or "clean")
-    images = [LEFT, *RIGHTS]
-    assert cleaned(images, DEFAULT.changed(sweep_pixels=77_777)) == "clean" and asked == [(images, 77_777)]
-    assert cleaned(images, DEFAULT.changed(clean_images=False)) is images and len(asked) == 1
+    monkeypatch.setattr(module, "clean", lambda *given: asked.append(given) or "clean")
+    images, masks = [LEFT, *RIGHTS], [None] * 3
+    assert cleaned(images, masks, DEFAULT.changed(sweep_pixels=77_777)) == "clean"
+    assert asked == [(images, 77_777, masks)]
+    assert cleaned(images, masks, DEFAULT.changed(clean_images=False)) is images and len(asked) == 1
+
+
+def test_flaws_are_measured_further_inside_than_the_blended_edge_of_borders(monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "clean", lambda images, pixels, masks: asked.append(masks) or images)
+    valid = torch.ones(SIZE, dtype=torch.bool)
+    valid[:, :6] = False
+    posed = PosedViews(view_of(LEFT, K)._replace(valid=valid), VIEWS)
+    assert module._with_clean_images(posed, DEFAULT) is posed
+    ((of_left, *of_rights),) = asked
+    assert of_rights == [None, None] and torch.equal(of_left, eroded(valid, BLEND_PX))
 
 
 def test_clean_images_take_the_places_of_theirs_and_cameras_stay(monkeypatch):
     monkeypatch.setattr(
-        module, "clean", lambda images, pixels: [image + 1 + i for i, image in enumerate(images)]
+        module, "clean", lambda images, pixels, masks: [image + 1 + i for i, image in enumerate(images)]
     )
     posed = PosedViews(view_of(LEFT, K), VIEWS)
     found = module._with_clean_images(posed, DEFAULT)
@@ -73,12 +85,12 @@ def test_clean_images_take_the_places_of_theirs_and_cameras_stay(monkeypatch):
         monkeypatch.setattr(
             module,
             "clean",
-            lambda images, pixels, changed=changed: [
+            lambda images, pixels, masks, changed=changed: [
                 x + 1 if i == changed else x for i, x in enumerate(images)
             ],
         )
         assert module._with_clean_images(posed, DEFAULT) is not posed
-    monkeypatch.setattr(module, "clean", lambda images, pixels: list(images))
+    monkeypatch.setattr(module, "clean", lambda images, pixels, masks: list(images))
     assert module._with_clean_images(posed, DEFAULT) is posed
 
 
@@ -121,7 +133,7 @@ def stages(monkeypatch):
         monkeypatch.setattr(each, "posed_greys", greys)
         monkeypatch.setattr(each, "measure_fit", fit)
         monkeypatch.setattr(each, "image_facts", lambda given: ("facts of", given))
-    monkeypatch.setattr(module, "clean", lambda images, pixels: [image + 0.01 for image in images])
+    monkeypatch.setattr(module, "clean", lambda images, pixels, masks: [image + 0.01 for image in images])
     return calls
 
 

@@ -92,7 +92,7 @@ def solved(monkeypatch):
         return module._Solved(units, [posed(0), posed(1)], tracks, 0.034)
 
     monkeypatch.setattr(
-        module, "cleaned", lambda images, config: asked.update(raw=images, config=config) or "clean"
+        module, "cleaned", lambda images, masks, config: asked.update(raw=images, config=config) or "clean"
     )
     monkeypatch.setattr(module, "_solve", solve)
     return asked

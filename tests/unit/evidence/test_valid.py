@@ -13,6 +13,8 @@ from geodiff_plugin import InputError
 from geodiff_plugin.cameras import eroded, resized_mask
 from geodiff_plugin.evidence.inputs import left_alphas
 from geodiff_plugin.evidence.valid import (
+    BLEND_PX,
+    RIM_PX,
     alpha_mask,
     as_mask,
     both,
@@ -20,6 +22,7 @@ from geodiff_plugin.evidence.valid import (
     content_mask,
     filled,
     neutral_views,
+    outside_borders,
     read_mask,
 )
 from tests.tiny import render_plane
@@ -155,7 +158,19 @@ def test_borders_of_any_colour_that_all_views_have_are_found(colour, shape, qual
     pairs = neutral_views([tensor(scene(0)), tensor(scene(1))], [None, None])
     assert all(mask is None for _, mask in pairs)
     for (image, mask), border in zip(neutral_views(views, [None, None]), found, strict=True):
-        assert torch.equal(mask, border) and not torch.equal(image[:, ~mask], views[0][:, ~mask])
+        assert torch.equal(mask, eroded(border, RIM_PX))
+        assert not torch.equal(image[:, ~mask], views[0][:, ~mask])
+
+
+def test_the_rim_of_a_detected_border_gets_no_depth_and_that_of_a_given_mask_does():
+    valid = torch.from_numpy(CIRCLE)
+    black = torch.where(valid, tensor(scene()), 0.0)
+    (found,) = outside_borders([black], [None])
+    assert torch.equal(found, eroded(content_mask(black), RIM_PX)) and found.sum() < valid.sum()
+    assert outside_borders([black], [valid])[0] is valid
+    image, _ = neutral_views([black], [None])[0]
+    assert torch.equal(image, filled(black, eroded(content_mask(black), BLEND_PX)))
+    assert outside_borders([tensor(scene())] * 2, [None, None]) == [None, None]
 
 
 @pytest.mark.parametrize("sky", [90.0, 200.0])

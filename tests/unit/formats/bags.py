@@ -39,9 +39,19 @@ def write_bag(path: Path, topics=TOPICS, encoding: str = "rgb8", images=None, **
         for side, topic in enumerate(topics):
             P = np.column_stack([K, (-60.0 * 0.12 * side, 0, 0)])
             matrices = [np.asarray(m, float).ravel() for m in (info["D"], info["K"], info["R"][side], P)]
-            roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+            window = info.get("roi", (0, 0, 0, 0))  # x, y, height, width
+            roi = store.types["sensor_msgs/msg/RegionOfInterest"](*window, False)
             base = topic.removesuffix("/compressed").rpartition("/")[0]
-            write(f"{base}/camera_info", "CameraInfo", 0, *SIZE, info["model"], *matrices, 0, 0, roi)
+            write(
+                f"{base}/camera_info",
+                "CameraInfo",
+                0,
+                *SIZE,
+                info["model"],
+                *matrices,
+                *info.get("binning", (0, 0)),
+                roi,
+            )
             for number, seconds in enumerate(((0.0, 0.1, 0.2), (0.001, 0.099, 0.35))[side]):
                 image, at_ns = rgb(number, side) if images is None else images[side], round(1e9 * seconds)
                 if topic.endswith("/compressed"):

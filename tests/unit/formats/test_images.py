@@ -629,6 +629,24 @@ def test_split_views_keep_the_type_of_the_image_and_adapt_k(layout):
     assert isinstance(both, tuple) and both[1][0, 0] > both[0][0, 0]
 
 
+@pytest.mark.parametrize("layout", ["full", "over-under"])
+def test_split_views_keep_the_alpha_channel(layout):
+    pixels = RNG.integers(0, 256, (80, 120, 4), np.uint8)
+    expected = np.split(pixels, 2, axis=0 if layout == "over-under" else 1)
+    for image in (pixels, Image.fromarray(pixels), torch.from_numpy(pixels).permute(2, 0, 1)):
+        for view, half in zip(split_views(image, np.eye(3), layout)[:2], expected, strict=True):
+            view = view.permute(1, 2, 0) if isinstance(view, torch.Tensor) else view
+            np.testing.assert_array_equal(np.asarray(view), half)
+
+
+def test_split_views_infer_the_same_layout_with_and_without_an_alpha_channel():
+    pixels = np.vstack([RNG.integers(0, 256, (60, 80, 3), np.uint8)] * 2)
+    alpha = RNG.integers(0, 256, (120, 80, 1), np.uint8)
+    with pytest.warns(UserWarning, match=r"the image holds the views one above the other"):
+        left, _, _ = split_views(np.dstack([pixels, alpha]), np.eye(3) * [[50], [50], [1]])
+    np.testing.assert_array_equal(left, np.dstack([pixels, alpha])[:60])
+
+
 def test_split_views_warn_of_an_inferred_layout_and_name_what_is_wrong():
     pixels = np.hstack([RNG.integers(0, 256, (60, 80, 3), np.uint8)] * 2)
     with pytest.warns(UserWarning, match=r"the image holds the views side by side \(full\)"):

@@ -65,6 +65,22 @@ def test_every_sample_is_recognized_with_its_formats_properties(sample):
     assert named == (["file1.dat", "file2.dat"] if name == "vins" else None)
 
 
+def test_one_file_of_a_pair_is_enough_for_a_left_image_alone_only_for_camera_info(tmp_path):
+    for name in ("ros", "mvsnet", "euroc"):
+        sample = next(sample for sample in SAMPLES if format_name(sample) == name)
+        files = {Path("0.txt"): SAMPLES[sample][0]}
+        with pytest.raises(InputError, match="calibration must be 2 files"):
+            reading._format_of(files)
+        if name != "ros":
+            with pytest.raises(InputError, match="calibration must be 2 files"):
+                reading._format_of(files, is_alone=True)
+            continue
+        (tmp_path / "left.yaml").write_text(SAMPLES[sample][0])
+        rig = reading.read_calibration(tmp_path / "left.yaml", distorted=True, is_alone=True)
+        np.testing.assert_array_equal(rig.K_left, rig.K_right)
+        assert not reading.is_as_stored(tmp_path / "left.yaml")
+
+
 @pytest.mark.parametrize("name", ["middlebury", "mvsnet", "ros_ini", "opencv"])
 def test_the_number_of_files_must_fit_the_format(name):
     entry = reading.CALIBRATION_FORMATS[name]

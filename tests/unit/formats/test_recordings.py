@@ -368,6 +368,24 @@ def rig_of(path: Path, topics, folder: Path):
     return read_calibration(files, distorted=True)
 
 
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_the_region_and_the_binning_of_a_bag_change_its_cameras(tmp_path, suffix):
+    height, width = bags.SIZE
+    window = (6, 4, height, width)  # x, y, height, width
+    path = bags.write_bag(tmp_path / f"a{suffix}", roi=window, binning=(2, 2))
+    texts, _ = stereo_calibration(path, bags.TOPICS)
+    files = [tmp_path / f"{number}.yaml" for number in range(2)]
+    for file, text in zip(files, texts, strict=True):
+        file.write_text(text)
+    shifted = bags.K - [[0, 0, 6], [0, 0, 4], [0, 0, 0]]
+    binned = read_calibration(files, image_size=(width // 2, height // 2))
+    np.testing.assert_allclose(binned.K_left, np.diag([0.5, 0.5, 1]) @ shifted)
+    assert binned.size_left == (width // 2, height // 2)
+    assert np.linalg.norm(binned.E[:3, 3]) == pytest.approx(0.12)
+    stated = read_calibration(files, image_size=(width, height))  # a driver that writes K of the images
+    np.testing.assert_allclose(stated.K_left, shifted)
+
+
 def test_cameras_of_raw_images(tmp_path) -> None:
     """A point that both rectified cameras see is where the poses of the raw ones have it."""
     D, model = [0.1, 0.02, 0, 0], "equidistant"

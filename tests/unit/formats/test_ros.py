@@ -192,6 +192,30 @@ def test_ros_files_of_single_cameras_are_rejected():
         ros([left, info(1, P1, R2)])
 
 
+def test_one_camera_info_is_enough_for_a_left_image_alone():
+    (P1, R1), _ = rectified()
+    alone = CameraChoice(is_alone=True)
+
+    def single(**changes):
+        return of_ros.read_ros((json.dumps(info(0, P1, R1, **changes)),), alone)
+
+    of_rectified = single()
+    np.testing.assert_allclose(of_rectified.K_left, P1[:, :3])
+    assert of_rectified.left.lens is None and of_rectified.size_left == SIZE_LEFT
+    for raw in (
+        {"projection_matrix": {"data": [0.0] * 12}},
+        {"projection_matrix": None},
+        {"rectified": False},
+    ):
+        rig = single(**raw)
+        np.testing.assert_allclose(rig.K_left, K_LEFT)
+        np.testing.assert_allclose(rig.left.lens.coefficients, LENSES[0][:5])
+        np.testing.assert_array_equal(rig.E, np.eye(4))
+    binned = single(projection_matrix=None, binning_x=2, binning_y=2, roi={"x_offset": 40})
+    np.testing.assert_allclose(binned.K_left[0], (K_LEFT[0] - [0, 0, 40]) / 2)
+    assert binned.size_left == (SIZE_LEFT[0] // 2, SIZE_LEFT[1] // 2)
+
+
 def ini(n: int, P, R) -> str:
     width, height = SIZES[n]
     parts = [f"# oST\n\n[image]\n\nwidth\n{width}\n\nheight\n{height}\n\n[side]\n"]

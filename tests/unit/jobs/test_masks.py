@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin import InputError
-from geodiff_plugin.formats import find_mask
+from geodiff_plugin.formats import find_mask, undistorted
 from geodiff_plugin.jobs.masks import SAMPLES, SPAN, find_overlays
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef, options_of
@@ -60,12 +60,56 @@ def test_pixels_of_alpha_0_are_not_valid(files, tmp_path):
     assert np.array_equal(masks_of(pair)[0], valid) and pair.left.shape == image.shape
 
 
+@pytest.mark.filterwarnings("ignore:.*transparent pixels")
+@pytest.mark.parametrize("layout", ["full", "over-under"])
+def test_the_alpha_channel_of_an_image_with_both_views_is_split_like_it(files, tmp_path, layout):
+    axis = 0 if "over" in layout else 1
+    image = np.concatenate([(image_of(files, "left") * 255).round().astype(np.uint8)] * 2, axis)
+    left, right = left_part(files, "left"), left_part(files, "left")[:, ::-1]
+    alpha = np.concatenate([left, right], axis).astype(np.uint8) * 255
+    Image.fromarray(np.dstack([image, alpha])).save(tmp_path / "both.png")
+    further = image_of(files, "third")
+    shown = np.arange(further.shape[1])[None].repeat(len(further), 0) > 9
+    rgba = np.dstack([(further * 255).astype(np.uint8), shown.astype(np.uint8) * 255])
+    Image.fromarray(rgba).save(tmp_path / "third.png")
+    more = {"left": tmp_path / "both.png", "right": None, "side_by_side": layout, "k_right": None}
+    pair = read_pair(options(files, "third", **more | {"view": (tmp_path / "third.png",)}))
+    for found, expected in zip(masks_of(pair), (left, right, shown), strict=True):
+        assert np.array_equal(found, expected)
+
+
 def test_undistortion_leaves_pixels_without_content(files):
     """A pincushion lens: corners of the straight image lie outside of the one that was taken."""
     pair = read_pair(options(files, distortion=("0.3,0,0,0",)))
     left, right = masks_of(pair)
     black = (pair.left == 0).all(-1)
     assert black.any() and not left[black].any() and left.mean() > 0.5 and right is not None
+
+
+def with_white_frames(files: Path, folder: Path, width: int = 12) -> Path:
+    """The files with a white border on the left of both images."""
+    own = shutil.copytree(files, folder)
+    for name in ("left", "right"):
+        image = (image_of(files, name) * 255).round().astype(np.uint8)
+        image[:, :width] = 255
+        Image.fromarray(image).save(own / f"{name}.png")
+    return own
+
+
+def test_borders_of_both_images_are_found_before_undistortion_and_next_to_overlays(files, tmp_path):
+    own = with_white_frames(files, tmp_path / "own")
+    height, width = image_of(files, "left").shape[:2]
+    pair = read_pair(options(own, distortion=("-0.1,0,0,0",)))
+    for mask, camera in zip(masks_of(pair), pair.cameras, strict=True):
+        white = np.zeros((*mask.shape, 3), np.float32)
+        white[:, :12] = 1
+        straight = undistorted(white, camera)[..., 0] > 0
+        assert straight.any() and not mask[straight].any() and mask.mean() > 0.7
+    overlays = np.zeros((height, width), bool)
+    overlays[:5, 40:50] = True
+    left, right = masks_of(read_pair(options(own), overlays=overlays))
+    assert not left[:, :12].any() and not left[:5, 40:50].any() and left[8:, 20:].all()
+    assert not right[:, :12].any() and right[8:, 20:].all()
 
 
 def test_a_mask_of_another_size_is_an_error_that_names_the_option(files, tmp_path):

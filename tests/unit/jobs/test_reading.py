@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from geodiff_plugin._internal.checks import InputError, InputFileError, UnknownPoseError
@@ -91,6 +92,19 @@ def test_known_depths_alone_need_one_camera(files, tmp_path):
     with pytest.raises(InputError, match="K "):
         read_pair(options(files, **alone | {"k": tmp_path / "K.txt"}))
     read_pair(options(files, **alone | {"k": tmp_path / "K.txt"}, cropped=True))
+
+
+def test_one_camera_info_is_enough_for_points_of_a_left_image_alone(files, tmp_path):
+    np.save(tmp_path / "points.npy", np.array([[0.1, 0.2, 2.5], [0.0, -0.1, 3.0]]))
+    height, width = image_of(files, "left").shape[:2]
+    K = np.loadtxt(files / "K-left.txt")
+    entries = {"width": width, "height": height, "distortion_model": "plumb_bob", "K": K.ravel().tolist()}
+    entries |= {"D": [-0.1, 0.02, 0, 0, 0], "R": np.eye(3).ravel().tolist(), "P": [0.0] * 12}
+    (tmp_path / "left.yaml").write_text(yaml.safe_dump(entries))
+    alone = {"right": None, "k": None, "k_right": None, "e": None, "points": tmp_path / "points.npy"}
+    pair = read_pair(options(files, **alone, calib=(tmp_path / "left.yaml",)))
+    np.testing.assert_allclose(pair.rig.K_left, K)
+    assert pair.undistorted and len(pair.cameras) == 1 and not pair.guidance.rights
 
 
 def test_images_are_undistorted_by_the_lens_of_each_view(files):

@@ -20,6 +20,7 @@ from tests.scenes import SyntheticPair, render_pair
 from tests.views import posed_of, view_of
 
 END_TO_END = pytest.mark.end_to_end
+GRID = 210_000
 
 
 def quantization(quality: int) -> np.ndarray:
@@ -168,6 +169,51 @@ def test_the_noise_of_a_few_blocks_is_interpolated_between_two_of_them():
     assert flaws_of(levels)[0].noise == pytest.approx(expected, rel=1e-4)
 
 
+MASKS = {
+    "circle": np.hypot(*(np.mgrid[:168, :200] - np.array([84, 100])[:, None, None])) < 80,
+    "wedge": np.add.outer(np.linspace(0, 20, 168), np.zeros(200)) + 5 < np.arange(200),
+    "holes": np.random.default_rng(0).random((7, 8)).repeat(24, 0).repeat(25, 1) > 0.2,
+}
+
+
+def masked_flaws(levels: np.ndarray, valid: np.ndarray) -> Flaws:
+    """The flaws of an image whose content is a smooth gradient where it is not valid."""
+    smooth = np.linspace(60, 120, levels.shape[1])
+    given = torch.from_numpy(np.where(valid, levels, smooth)[None]).float()
+    return find_flaws(given, torch.from_numpy(valid)[None])[0]
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_smooth_content_outside_of_the_mask_hides_no_flaws(name):
+    grainy = np.linspace(60, 120, 200) + 5 * np.random.default_rng(1).normal(size=(168, 200))
+    (whole,) = flaws_of(grainy)
+    assert whole.noise == pytest.approx(5.0, rel=0.08)
+    assert masked_flaws(grainy, MASKS[name]).noise == pytest.approx(whole.noise, rel=0.05)
+    blocky = np.pad(compressed(photo(3), 30), ((0, 3), (0, 5)))[3:, 5:]
+    scale = flaws_of(blocky)[0].jpeg_scale
+    assert scale > 0 and masked_flaws(blocky, MASKS[name]).jpeg_scale == pytest.approx(scale, rel=0.05)
+    (edges,) = find_flaws(torch.from_numpy(blocky)[None].float(), torch.ones(1, *blocky.shape).bool())
+    assert edges.jpeg_scale == pytest.approx(scale)
+
+
+def test_a_mask_without_a_whole_block_shows_no_flaws():
+    valid = np.zeros((168, 200), bool)
+    valid[:5] = True
+    assert masked_flaws(compressed(photo(3), 30), valid) == Flaws(0.0, 0.0)
+
+
+def test_each_masked_image_is_cleaned_by_the_flaws_of_its_valid_pixels():
+    valid = torch.from_numpy(MASKS["circle"])
+    clear = torch.from_numpy(photo(5, falls=2.0)[None] / 255).float()
+    grainy = (clear + 6 / 255 * torch.randn(clear.shape, generator=torch.Generator().manual_seed(0))).clamp(
+        0, 1
+    )
+    filled = torch.where(valid, grainy, 0.4)
+    plain, masked, unmasked = clean([grainy, filled, filled], GRID, [None, valid, None])
+    assert torch.equal(plain, clean([grainy], GRID)[0]) and unmasked is filled
+    assert (masked - clear)[:, valid].square().mean() < 0.5 * (filled - clear)[:, valid].square().mean()
+
+
 @pytest.mark.parametrize(
     ("scale", "noise", "counted"), [(0.4, 0.0, 0.0), (0.0, 2.25, 1.125), (0.3, 5.0, 5.0), (0.5, 1.6, 0.0)]
 )
@@ -232,9 +278,6 @@ def test_each_image_of_a_list_is_cleaned_by_its_own_flaws_and_keeps_its_colours(
     assert (
         clean(given[1:2], int(least))[0] is not given[1] and clean(given[1:2], int(least) - 1)[0] is given[1]
     )
-
-
-GRID = 210_000
 
 
 @pytest.fixture(scope="module")

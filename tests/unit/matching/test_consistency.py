@@ -185,3 +185,19 @@ def test_what_is_known_without_deviations_is_left_to_the_reference(asked_kernels
     matches = batch()
     assert known_fraction(matches) == "matching.kernels.windows.known_fraction"
     assert (known_fraction(replace(matches, deviation=None)) == 1).all() and len(asked_kernels) == 1
+
+
+def test_window_means_of_a_masked_image_are_those_of_its_valid_pixels():
+    rng = np.random.default_rng(0)
+    maps, valid = rng.random((2, 20, 31)).astype(np.float32), rng.random((20, 31)) > 0.4
+    valid[:, :12] = False  # whole windows without a valid pixel
+    given, radius = torch.from_numpy(maps), consistency.CONTRAST_RADIUS
+    found = consistency._means_of_valid(given, torch.from_numpy(valid)).numpy()
+    for v, u in np.ndindex(valid.shape):
+        window = np.s_[max(v - radius, 0) : v + radius + 1, max(u - radius, 0) : u + radius + 1]
+        inside = valid[window]
+        expected = maps[:, *window][:, inside].mean(1) if inside.any() else 0.0
+        np.testing.assert_allclose(found[:, v, u], expected, rtol=1e-4, atol=1e-6)
+    assert torch.equal(consistency._means_of_valid(given, None), window_mean(given, radius))
+    other = torch.where(torch.from_numpy(valid), given, 100.0)
+    np.testing.assert_array_equal(consistency._means_of_valid(other, torch.from_numpy(valid)), found)

@@ -265,3 +265,11 @@ def test_strips_among_matches_without_deviations_are_left_to_the_reference(asked
     assert with_occluded(matches, strips) == "matching.kernels.windows.with_occluded"
     matches = replace(matches, deviation=None)
     assert torch.equal(with_occluded(matches, strips).confidence, confidence) and len(asked_kernels) == 1
+
+
+def test_a_match_is_known_only_if_the_right_pixel_is_valid():
+    valid = np.ones((2, 8), bool)
+    valid[0, 2:4] = valid[1, 0] = False
+    disparity = np.array([[0.0, 0, 0, 0.4, 2.0, 2.4, 2.6, -5.0], [3.0] * 8], np.float32)
+    expected = [[True, True, False, False, False, False, False, True], [False] * 4 + [True] * 4]
+    assert rows._seen_valid(valid, disparity).tolist() == expected

@@ -1065,3 +1065,18 @@ def test_a_dense_match_holds_where_the_flow_from_its_place_leads_back(monkeypatc
     landed = centres[:, 0] + 6
     np.testing.assert_array_equal(holds, (landed >= 30) & (landed <= 79))
     np.testing.assert_allclose(px[holds], centres[holds] + [6.0 + 2.5, 0.0])
+
+
+def test_the_mask_of_a_warped_image_moves_with_it():
+    """A pixel is valid if all that it is made of is."""
+    size = (60, 90)
+    coefficients = np.zeros((10, 2))
+    coefficients[0] = 3.0, 0.0
+    displacement = Displacement(coefficients, size, 5.0, 3.0)
+    valid = torch.ones(size, dtype=torch.bool)
+    valid[:, 40:] = False
+    found = refine._warp_mask(valid, displacement)
+    assert found.dtype == torch.bool and found[:, :40].all() and not found[:, 45:].any()
+    assert refine._warp_mask(None, displacement) is None
+    content = torch.where(valid, 0.25, 1.0)[None]
+    assert torch.allclose(warp_image(content, displacement)[0][found], torch.tensor(0.25), atol=0.01)

@@ -560,3 +560,42 @@ def _plain_features(grey):
     points, descriptors = cv2.SIFT.create(nfeatures=4000, contrastThreshold=0.01).detectAndCompute(grey, None)
     root = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     return cv2.KeyPoint.convert(points), root
+
+
+def test_features_that_reach_into_invalid_pixels_are_dropped():
+    valid = np.ones((40, 60), bool)
+    valid[:, :20] = False
+    view = grey_of(np.zeros((40, 60), np.uint8), PLANE_K)
+    px = np.array([[10.0, 20.0], [23.0, 20.0], [23.0, 20.0], [50.0, 5.0]])
+    diameter, descriptors = np.array([2.0, 2.0, 9.0, 9.0]), np.arange(8.0).reshape(4, 2)
+    for mask, kept in ((valid, [1, 3]), (None, [0, 1, 2, 3])):
+        found = tracks_module._valid_features(px, diameter, descriptors, view._replace(valid=mask))
+        np.testing.assert_array_equal(found[0], px[kept])
+        np.testing.assert_array_equal(found[1], descriptors[kept])
+
+
+@pytest.mark.parametrize("method", ["sparse", "dense"])
+def test_masked_images_are_matched_at_valid_pixels_only(method):
+    """Whatever the images show elsewhere: an overlay there would match itself."""
+    images, depth = plane_views()
+    masks, views = [], []
+    overlay = np.random.default_rng(0).integers(0, 255, (90, 30), np.uint8)
+    for image, K in zip(images[:2], (PLANE_K, PLANE_K_RIGHTS[0]), strict=True):
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        grey[:, :30] = overlay[: len(grey)]
+        valid = np.ones(grey.shape, bool)
+        valid[:, :30] = False
+        masks.append(valid)
+        views.append(grey_of(grey, K)._replace(valid=valid))
+    Ts = np.linalg.inv(PLANE_POSES[:1])
+    if method == "sparse":
+        tracks, plain = (
+            sparse_tracks(each) for each in (views, [view._replace(valid=None) for view in views])
+        )
+        assert (plain.left_px[:, 0] < 30).any()
+    else:
+        tracks = dense_tracks(views, torch.from_numpy(depth)[None, None], Ts)
+    assert len(tracks) > 12
+    for px, valid in zip((tracks.left_px, tracks.right_px[0]), masks, strict=True):
+        column, row = np.rint(px[tracks.seen[0]]).astype(int).T
+        assert valid[row, column].all()

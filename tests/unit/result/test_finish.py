@@ -14,7 +14,7 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.algorithm.match_fitting import DepthFit
 from geodiff_plugin.algorithm.member import Member
-from geodiff_plugin.cameras import PosedViews
+from geodiff_plugin.cameras import PosedViews, resized_mask
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.findings import Finding
@@ -248,6 +248,28 @@ def test_numbers_that_no_member_has_stay_unknown():
     seen = finish(evidence_of(), two, merged(two), None, ResultOptions(DEFAULT)).verdict.facts
     assert seen[PriorCorrelation].rank_correlation == pytest.approx(0.6)
     assert seen[PriorScale] is None and not seen[SearchEdge].on_edge
+
+
+def test_a_prior_that_is_wrong_outside_of_the_mask_does_not_change_its_ratio():
+    valid = torch.zeros(NATIVE, dtype=torch.bool)
+    valid[:, : NATIVE[1] // 3] = True
+    evidence = evidence_of()
+    masked = replace(
+        evidence, native=evidence.native._replace(left=evidence.native.left._replace(valid=valid))
+    )
+    inside = resized_mask(resized_mask(valid, OUTPUT), PROCESSING)
+    wrong = [
+        replace(each, prior_depth_m=torch.where(inside, each.prior_depth_m, 50 * each.prior_depth_m))
+        for each in MEMBERS
+    ]
+    plain, found = (
+        finish(masked, each, merged(MEMBERS), None, ResultOptions(DEFAULT)) for each in (MEMBERS, wrong)
+    )
+    torch.testing.assert_close(found.over_prior, plain.over_prior, equal_nan=True)
+    assert torch.equal(found.over_prior.isnan(), ~inside.flatten().expand(len(MEMBERS), -1))
+    assert found.verdict.facts[PriorScale] == plain.verdict.facts[PriorScale]
+    unmasked = finish(evidence, wrong, merged(MEMBERS), None, ResultOptions(DEFAULT))
+    assert unmasked.verdict.facts[PriorScale].ratio < 0.1 * plain.verdict.facts[PriorScale].ratio
 
 
 def test_without_a_unit_the_priors_metres_do_not_judge():

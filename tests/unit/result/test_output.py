@@ -1,5 +1,6 @@
 """Every field of a batch's output, of which no two images, members or numbers are alike."""
 
+import math
 from dataclasses import fields, replace
 from types import SimpleNamespace
 
@@ -134,6 +135,18 @@ def test_every_field_of_the_output_is_that_of_its_image(as_numpy):
     checked = {*MAPS.values(), "scale", "shift", "global_scale", "prior_scale", "prior_error", "K", "history"}
     checked |= {"poses", "verdicts", "unit", "latent", "scale_from", "scale_rel_std", "rescaled"}
     assert names == checked | {"findings", "extras", "measurable_m"}
+
+
+def test_ratios_to_the_prior_are_unknown_where_pixels_are_not_valid():
+    """They change neither the scale from the prior nor its spread."""
+    results = [result_of(i) for i in range(COUNT)]
+    partly = [
+        replace(each, over_prior=torch.cat([each.over_prior, torch.full((MEMBERS, 40), math.nan)], 1))
+        for each in results
+    ]
+    expected, found = (stack_results(each, guidance(unit=None), []) for each in (results, partly))
+    for name in ("prior_scale", "rescaled", "scale_rel_std", "prediction"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 @pytest.mark.parametrize("name", [*list(MAPS)[1:], "prior_error", "over_prior"])

@@ -113,6 +113,34 @@ def test_borders_are_found_when_the_rig_is_checked(rig, frame):
     assert same is dark.guidance
 
 
+def white_framed(frame: StereoFrame) -> StereoFrame:
+    """The frame with a white border of 12 pixels on the left of both images."""
+    left, right = frame.left.copy(), frame.right.copy()
+    left[:, :12] = right[:, :12] = 255
+    return StereoFrame(left, right)
+
+
+def test_a_border_of_any_colour_in_both_images_is_found(rig, frame):
+    live = LiveRig(setup_of_rig(rig, FAST), CPU, check_every=10)
+    (given,) = live.prepare(white_framed(frame)).guidance.inputs
+    for mask in (given.mask, given.views[0].valid):
+        assert not mask[:, :12].any() and mask[:, 20:].all()
+
+
+def test_a_border_is_found_before_lens_distortion_is_removed(rig, frame):
+    lens = Distortion("opencv", np.array([-0.2, 0.05, 0.0, 0.0]))
+    bent = replace(rig, left=replace(rig.left, lens=lens), right=replace(rig.right, lens=lens))
+    prepared = LiveRig(setup_of_rig(bent, FAST), CPU, check_every=10).prepare(white_framed(frame))
+    (given,) = prepared.guidance.inputs
+    height, width = frame.left.shape[:2]
+    white = np.zeros((height, width, 3), np.float32)
+    white[:, :12] = 1
+    straight = prepare.pinhole(white, replace(bent.left, size=(width, height)), FAST)[..., 0] > 0
+    for mask in (given.mask, given.views[0].valid):
+        valid = np.asarray(mask)
+        assert straight.any() and not valid[straight].any() and valid.mean() > 0.7
+
+
 def test_a_given_mask_is_used_for_every_frame(rig, frame):
     mask = np.ones(frame.left.shape[:2], bool)
     mask[:, :15] = False
@@ -188,11 +216,30 @@ def test_what_is_assumed_about_a_rig_is_kept_for_its_frames(rig, frame):
         assert [finding.code for finding in live.prepare(frame).guidance.findings] == ["camera.assumed-cx"]
 
 
+@pytest.mark.parametrize("bent", [False, True])
+def test_a_border_does_not_hide_the_noise_of_images(rig, frame, bent):
+    rng = np.random.default_rng(0)
+    grainy = [each + rng.normal(0, 8, (*each.shape[:2], 1)) for each in (frame.left, frame.right)]
+    dirty = white_framed(StereoFrame(*(each.clip(0, 255).astype(np.uint8) for each in grainy)))
+    lens = Distortion("opencv", np.array([-0.02, 0.0, 0.0, 0.0]))
+    if bent:
+        rig = replace(rig, left=replace(rig.left, lens=lens), right=replace(rig.right, lens=lens))
+    live = LiveRig(setup_of_rig(rig, FAST), CPU, check_every=2)
+    prepared = live.prepare(dirty)
+    if not bent:
+        assert prepared.guidance.config.clean_images
+        return
+    camera = replace(rig.left, size=dirty.left.shape[1::-1])
+    grainy_01 = prepare.pinhole(np.float32(dirty.left) / 255, camera, FAST.changed(clean_images=False))
+    inside = np.s_[20:-20, 40:-20]
+    assert np.abs(prepared.left[inside] - grainy_01[inside]).mean() > 3 / 255
+
+
 @pytest.mark.parametrize("blocks", [False, True])
 def test_images_that_a_check_finds_clean_are_not_examined_again(rig, frame, monkeypatch, blocks):
     examined, changed = [], []
 
-    def clean(images, _):
+    def clean(images, *_):
         examined.append(1)
         return [image + 0.0 for image in images] if blocks else images
 

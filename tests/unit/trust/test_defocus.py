@@ -70,3 +70,26 @@ def test_a_blank_image_is_inconclusive():
     assert log_detail_ratio(blank) is None and facts_of(texture(7), blank) is None
     assert facts_of(blank, texture(7)) is None and codes(None) == []
     assert facts_of(texture(7), blank, texture(8)).view == 1
+
+
+def test_smooth_content_of_invalid_pixels_does_not_count():
+    """Detail is compared where each view is most textured among its valid pixels."""
+    image = blurred(texture(7), 0.8)
+    image[:, 200:] = blurred(texture(8), 3.0)[:, 200:]
+    valid = np.zeros(image.shape, bool)
+    valid[:, :180] = True
+    smooth = np.where(valid, image, 128).astype(np.uint8)
+    alone = log_detail_ratio(image[:, :180])
+    assert log_detail_ratio(smooth, valid) == pytest.approx(alone, abs=0.03)
+    stage = ImagesStage([image, smooth], [240, 240], [None, valid])
+    expected = log_detail_ratio(image) - log_detail_ratio(smooth, valid)
+    assert Defocus.of_images(stage).log_ratio == expected
+    for few in (400, 0):
+        assert log_detail_ratio(smooth, np.arange(image.size).reshape(image.shape) < few) is None
+
+
+def test_a_mask_of_all_pixels_changes_nothing():
+    image = texture(9)
+    assert log_detail_ratio(image, np.ones(image.shape, bool)) == pytest.approx(
+        log_detail_ratio(image), abs=1e-6
+    )

@@ -16,6 +16,8 @@ def test_the_median_over_all_members_and_pixels_counts_if_lengths_have_a_unit():
     assert measure_result(made_result(over_prior=OVER_PRIOR))[PriorScale] == Ratio(1.5)
     no_unit = made_result(over_prior=OVER_PRIOR, call=Call(has_unit=False))
     assert measure_result(no_unit)[PriorScale] is None
+    outside = torch.cat([OVER_PRIOR, torch.full_like(OVER_PRIOR, torch.nan)], 1)  # of the mask
+    assert measure_result(made_result(over_prior=outside))[PriorScale] == Ratio(1.5)
     assert measure_result(made_result())[PriorScale] is None
     assert measure_result(made_result(over_prior=torch.full((1, 3), torch.nan)))[PriorScale] is None
 

@@ -36,28 +36,39 @@ class MessageSource:
     def __init__(self) -> None:
         self._pairs = Newest[tuple[Any, Any]]()
         self._infos: dict[str, Any] = {}
-        self._has_both = threading.Event()
+        self._first: tuple[Any, Any] | None = None
+        self._is_ready = threading.Event()
 
     def camera_info(self, side: str, info: Any) -> None:
         """Take the ``CameraInfo`` of ``"left"`` or ``"right"``; only the first one is used."""
         self._infos.setdefault(side, info)
-        if len(self._infos) == 2:
-            self._has_both.set()
+        self._set_ready()
 
     def images(self, left: Any, right: Any) -> None:
         """Take the images of one moment, in place of a pair that has not been processed yet."""
+        self._first = self._first or (left, right)
         self._pairs.put((left, right))
+        self._set_ready()
+
+    def _set_ready(self) -> None:
+        """Release ``rig`` once both cameras and an image are known."""
+        if len(self._infos) == 2 and self._first is not None:
+            self._is_ready.set()
 
     def rig(self, rectified: bool) -> Rig | None:
-        """Wait for the cameras and return their rig; ``None`` if the source was closed before."""
-        self._has_both.wait()
-        if len(self._infos) < 2:
+        """Wait for cameras and images and return the rig; ``None`` if the source was closed before.
+
+        The size of the images shows whether the cameras describe them before or after binning.
+        """
+        self._is_ready.wait()
+        if len(self._infos) < 2 or self._first is None:
             return None
-        return rig_of_messages(self._infos["left"], self._infos["right"], rectified)
+        height, width = images_of_messages(*self._first)[0].shape[:2]
+        return rig_of_messages(self._infos["left"], self._infos["right"], rectified, (width, height))
 
     def close(self) -> None:
         """End the frames."""
-        self._has_both.set()
+        self._is_ready.set()
         self._pairs.close()
 
     def __iter__(self) -> Iterator[StereoFrame]:
