@@ -84,8 +84,6 @@ def write_maps(
     formats.write_depth_npy(folder / "depth.npy", depth_m)
     valid = single_map(output.valid)
     zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m * valid)
-    figure = plotting.depth_figure(depth_m, *figure_range(output), unit=output.unit)
-    depth = _save_figure(figure, folder / "depth.png")
     maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
     names = ("photometric_error", "uncertainty", "confidence", "sigma")
     maps |= {name: single_map(x) for name in names if (x := getattr(output, name)) is not None}
@@ -94,18 +92,10 @@ def write_maps(
         formats.write_sigma_mm(folder / "sigma_mm.png", sigma_m)
     for name, values in maps.items():
         np.save(folder / f"{name}.npy", values.astype(np.float32))
+    left = in_8_bits(left)
+    _write_figures(folder, output, left, depth_m, maps)
     flying = formats.flying_points(depth_m)
     reliable = single_map(output.reliable(min_confidence, max_sigma))
-    confidence = error = None
-    if output.visible is not None:
-        visible = single_map(output.visible).astype(bool)
-        save_png(Image.fromarray(visible.astype(np.uint8) * 255), folder / "visible.png")
-        error = np.where(visible, maps["photometric_error"], np.nan)
-    if output.confidence is not None:
-        figure = plotting.fraction_figure(maps["confidence"], "confidence", 1.0)
-        confidence = _save_figure(figure, folder / "confidence.png")
-    left = in_8_bits(left)
-    save_png(plotting.overview(left, depth, confidence, error), folder / "overview.png")
     kept = _thinned(reliable & ~flying, max_points)
     cloud = folder / "cloud.ply"
     points = formats.write_ply(cloud, depth_m, left, K, valid=kept, unit=output.unit, sigma_m=sigma_m)
@@ -116,6 +106,27 @@ def write_maps(
         "doubtful_points": int((valid & ~reliable).sum()),
         "points_out_of_reach": int((~valid).sum()),
     }
+
+
+def _write_figures(
+    folder: Path,
+    output: MetricDepthOutput,
+    left: np.ndarray,
+    depth_m: np.ndarray,
+    maps: dict[str, np.ndarray],
+) -> None:
+    """Draw depth, visible pixels and confidence of the image ``left (H, W, 3)`` uint8, and an overview."""
+    figure = plotting.depth_figure(depth_m, *figure_range(output), unit=output.unit)
+    depth = _save_figure(figure, folder / "depth.png")
+    confidence = error = None
+    if output.visible is not None:
+        visible = single_map(output.visible).astype(bool)
+        save_png(Image.fromarray(visible.astype(np.uint8) * 255), folder / "visible.png")
+        error = np.where(visible, maps["photometric_error"], np.nan)
+    if output.confidence is not None:
+        figure = plotting.fraction_figure(maps["confidence"], "confidence", 1.0)
+        confidence = _save_figure(figure, folder / "confidence.png")
+    save_png(plotting.overview(left, depth, confidence, error), folder / "overview.png")
 
 
 def write_previews(
