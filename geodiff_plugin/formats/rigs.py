@@ -148,7 +148,8 @@ def reading_file(
         got = f"no {error}" if isinstance(error, KeyError) else got
         cut = _ended_early(error) or any(map(is_cut_off, texts))
         hint = "The file seems truncated." if cut else hint
-        code = "" if cut or str(error) != repr("baseline") else "calibration.no-baseline"
+        misses_baseline = isinstance(error, KeyError) and error.args == ("baseline",) and not cut
+        code = "calibration.no-baseline" if misses_baseline else ""
         bad_value(str(source), f"a whole {summary}", got, hint, code=code)
 
 
