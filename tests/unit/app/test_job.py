@@ -118,6 +118,10 @@ def test_lenses_of_phones_show_the_long_side_of_their_sensor():
     )
     assert lens.fx((4000, 2250)) == lens.fx((4000, 3000)) == lens.fx((3000, 4000)), "16:9 is a crop"
     assert 23 < LENSES["Samsung Galaxy S22, S23, S24: main lens"].equivalent_mm < 24.5
+    # A 24 mm lens in front of a 36 mm wide frame, and Apple's 26 mm main and 13 mm wide lenses.
+    assert LENSES["Camera with 24 mm (35 mm equivalent)"].fx((3600, 2400)) == pytest.approx(2400)
+    apple = [LENSES[f"iPhone 12, 13: {kind} lens"].equivalent_mm for kind in ("main", "wide")]
+    assert apple == [26, 13]
     assert all(10 < lens.equivalent_mm <= 50 for lens in LENSES.values())
 
 

@@ -23,7 +23,7 @@ from geodiff_plugin import enable_geometry_guidance
 from geodiff_plugin._internal.checks import InputError, UnknownFormatError, bad_value
 from geodiff_plugin.app import results, sessions, templates
 from geodiff_plugin.app.job import EXAMPLES, CameraFields, Priors, Request, request_of, run_job, write_job
-from geodiff_plugin.app.messages import ERRORS_ON_PAGE, PageError
+from geodiff_plugin.app.messages import ERRORS_ON_PAGE, Message, PageError
 from geodiff_plugin.app.results import Measurement
 from geodiff_plugin.app.sessions import Result, Stopped
 from geodiff_plugin.app.shown import clean_report, load, save, shown_of, visible_in_viewer
@@ -330,13 +330,18 @@ def coded(code: str) -> InputError:
     return raised.value
 
 
+INTERNAL_ERROR = templates.failed(
+    Message("Internal error (ZeroDivisionError).", "Your input is not the cause. Run again.")
+)
+
+
 @pytest.mark.parametrize(
     ("filled", "outcome", "notice"),
     [
         ((1, 2), coded("estimate.rotation"), ERRORS_ON_PAGE["estimate.rotation"][0]),
         ((1, 2), UnknownFormatError("x"), templates.LINK_TO_FORMATS),
         ((1, 2), Stopped(), templates.STOPPED),
-        ((1, 2), ZeroDivisionError("1/0"), "Internal error (ZeroDivisionError)."),
+        ((1, 2), ZeroDivisionError("1/0"), INTERNAL_ERROR),
         ((PageError("Enter fx as well."),), None, "Enter fx as well."),
     ],
 )

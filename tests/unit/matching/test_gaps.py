@@ -101,3 +101,11 @@ def test_a_step_that_is_chance_hides_nothing(step, hides):
 def test_a_hidden_gap_is_at_most_two_pixels_wider_than_its_step(width, hides):
     shift = np.array([[3.0] * 4 + [0.0] * width + [9.0] * 5], np.float32)
     assert hidden_pixels(shift, shift > 0)[0].tolist() == [hides and not known for known in (shift > 0)[0]]
+
+
+def test_a_gap_is_all_of_a_map_that_holds_in_each_of_its_pixels():
+    gaps = find_gaps(np.array([[True, False, False, True, False], [False, True, True, True, True]]))
+    values = np.array([[False, True, True, False, True], [False, True, True, True, True]])
+    assert gaps.all_of(values).tolist() == [True, True, False]
+    assert gaps.all_of(np.arange(10).reshape(2, 5) != 2).tolist() == [False, True, True]
+    assert find_gaps(np.ones((2, 5), bool)).all_of(values).shape == (0,)

@@ -13,6 +13,7 @@ from geodiff_plugin.matching.repetition import (
     CELL,
     MIN_PERIOD,
     _cells,
+    _expected,
     _rise,
     _second_minimum,
     if_repeated,
@@ -132,6 +133,18 @@ def test_the_unit_of_length_changes_nothing(factor):
     other = settle(matches_of(inverse / factor, repeated, 0.25 / factor), factor * prior)
     for name in one._fields:
         torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [(40, 80), (41, 86)], ids=["whole cells", "parts of cells"])
+def test_the_surroundings_are_aligned_with_the_image(size):
+    """The error of the prior changes along the rows, and the matches without a pattern show it."""
+    columns = np.linspace(-0.2, 0.2, size[1]) * np.ones(size)
+    inverse = 0.5 * np.exp(columns)
+    repeated = np.zeros(size)
+    repeated[:, -24:-16] = 1.0
+    log_expected, _ = _expected(matches_of(inverse, repeated, 0.25), torch.full((1, 1, *size), 2.0))
+    off = (log_expected[0, 0].numpy() - np.log(inverse))[:, -40:-8]
+    assert np.abs(off).max() < 0.03
 
 
 def test_a_candidate_beyond_infinity_is_none():

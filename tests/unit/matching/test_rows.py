@@ -273,3 +273,11 @@ def test_a_match_is_known_only_if_the_right_pixel_is_valid():
     disparity = np.array([[0.0, 0, 0, 0.4, 2.0, 2.4, 2.6, -5.0], [3.0] * 8], np.float32)
     expected = [[True, True, False, False, False, False, False, True], [False] * 4 + [True] * 4]
     assert rows._seen_valid(valid, disparity).tolist() == expected
+
+
+@pytest.mark.parametrize("shift_m", [-0.1, 0.1])
+def test_images_and_valid_pixels_are_mirrored_alike(shift_m):
+    levels = torch.arange(24, dtype=torch.uint8).view(2, 3, 4)
+    images = rows.RowImages(levels, 1.0, 100.0, np.float64(shift_m), (levels > 13).numpy())
+    for grey, valid in zip(images.greys(levels), images.compared(), strict=True):
+        np.testing.assert_array_equal(valid, grey > 13)
