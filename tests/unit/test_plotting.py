@@ -64,7 +64,7 @@ def test_flat_and_empty_maps_and_ends_beyond_the_data_have_a_range(depth, ends):
     ("call", "match"),
     [
         (lambda: depth_range(np.ones((3, 4)), far=float("inf")), "far"),
-        (lambda: colour_depth(np.ones((2, 3, 4))), "depth_m"),
+        (lambda: colour_depth(np.ones((2, 3, 4))), r"depth_m must be one map of shape \(H, W\)"),
         (lambda: grid([np.zeros((2, 2))], ["a", "b"]), "each with a title; got 1, 2 titles"),
         (lambda: grid([np.zeros((2, 2, 4))], ["a"]), "images"),
     ],
@@ -289,6 +289,8 @@ def test_titles_are_centred_above_images_and_rows_have_a_legend():
     np.testing.assert_array_equal(coloured[:, : plain.shape[1]], plain)
     legends = coloured[:, plain.shape[1] :]
     assert legends.shape[1] > 40 and not white(legends[:90]).all() and not white(legends[90:]).all()
+    drawn = np.flatnonzero(~white(legends).all(axis=1))
+    assert drawn.min() >= 6 + 24 and drawn.max() < 6 + 2 * 90 - 6, "bars are as high as the images"
     assert (legends[:90] != legends[90:180][: len(legends[:90])]).any(), "each row has its own range"
     second = [None, (1, 10)]
     coloured = np.asarray(grid(images, ["ab"] * 4, columns=2, cell_width=100, depth_ranges=second))

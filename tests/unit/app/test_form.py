@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from geodiff_plugin.app.form import DROP_HERE
 from geodiff_plugin.app.job import CAMERA_INPUTS, LIMITS, Priors
 from geodiff_plugin.app.messages import PageError
 from geodiff_plugin.options import PRESETS, RunOptions
@@ -37,6 +38,9 @@ def drawn():
 def handlers(drawn, component, event: str) -> list:
     """The page's functions for an event of a component."""
     return [f for f in drawn.page.fns.values() if (component._id, event) in f.targets]
+
+
+IMAGES = ("Left image", "Right image")
 
 
 @pytest.fixture
@@ -148,6 +152,15 @@ def test_an_example_fills_in_its_files_and_nothing_else(number, drawn):
     labels = captions or [entry["caption"] for entry in drawn.gallery.value]
     assert labels[number] == example.label and len(labels) == len(EXAMPLES)
     assert drawn.form.request(tuple(values.values())).name == example.label
+
+
+def test_what_appears_later_is_hidden_and_settings_are_closed_at_first(drawn):
+    blocks = [block for block in drawn.page.blocks.values() if isinstance(block, (gr.HTML, gr.Accordion))]
+    (poselib,) = [b for b in blocks if isinstance(b, gr.HTML) and "PoseLib" in str(b.value)]
+    assert not poselib.visible
+    assert [b.open for b in blocks if isinstance(b, gr.Accordion) and b.label == "Settings"] == [False]
+    drops = [b for b in drawn.page.blocks.values() if isinstance(b, gr.Image) and b.label in IMAGES]
+    assert [b.placeholder for b in drops] == [DROP_HERE] * 2
 
 
 def test_fields_are_named_limited_and_begin_as_they_should(drawn):
