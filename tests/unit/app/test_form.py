@@ -9,7 +9,6 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.app.form import DROP_HERE
 from geodiff_plugin.app.job import CAMERA_INPUTS, LIMITS, Priors
 from geodiff_plugin.app.messages import PageError
 from geodiff_plugin.options import PRESETS, RunOptions
@@ -155,6 +154,8 @@ def test_an_example_fills_in_its_files_and_nothing_else(number, drawn):
 
 
 def test_what_appears_later_is_hidden_and_settings_are_closed_at_first(drawn):
+    from geodiff_plugin.app.form import DROP_HERE
+
     blocks = [block for block in drawn.page.blocks.values() if isinstance(block, (gr.HTML, gr.Accordion))]
     (poselib,) = [b for b in blocks if isinstance(b, gr.HTML) and "PoseLib" in str(b.value)]
     assert not poselib.visible
