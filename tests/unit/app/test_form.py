@@ -304,4 +304,6 @@ def test_the_left_image_is_shown_for_taps_on_the_ends_of_a_known_length(drawn, p
 def test_a_run_is_named_by_its_files_before_they_are_checked(drawn, pair):
     values = tuple((drawn.form.initial | pair).values())
     assert drawn.form.name(values) == "left.png and right.png"
+    one_expired = drawn.form.initial | pair | {"right": f"{pair['right']}.expired"}
+    assert drawn.form.name(tuple(one_expired.values())) == "left.png and right.png.expired"
     assert drawn.form.name(tuple(drawn.form.initial.values())) == "without images"
