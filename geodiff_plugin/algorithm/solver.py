@@ -66,9 +66,9 @@ def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
     residual = (system.rhs * root).flatten(2) - apply(x)
     direction = residual.clone()
     along = dot(residual, residual)
-    enough = CONVERGED * along
+    enough, may_end = CONVERGED * along, not launch_bound(x)
     for _ in range(steps):
-        if not launch_bound(x) and bool((along <= enough).all()):
+        if may_end and bool((along <= enough).all()):
             break
         image = apply(direction)
         length = along / dot(direction, image).clamp_min(tiny)

@@ -103,6 +103,7 @@ def shown_of(run: PairRun, name: str, scale_rel_std: float | None = None) -> Sho
     if maps["sigma"] is not None and output.scale_rel_std is not None:  # lengths have it in common
         of_scale = output.scale_rel_std * single_map(output.prediction)
         maps["sigma"] = np.sqrt(np.maximum(maps["sigma"] ** 2 - of_scale**2, 0.0))
+    measurable_m = measurable_limit(output)
     return Shown(
         name=name,
         image=in_8_bits(inputs.left),
@@ -115,8 +116,8 @@ def shown_of(run: PairRun, name: str, scale_rel_std: float | None = None) -> Sho
         confidence=maps["confidence"],
         sigma_m=maps["sigma"],
         scale_rel_std=output.scale_rel_std if scale_rel_std is None else scale_rel_std,
-        beyond=beyond_limit(single_map(output.prediction), measurable_limit(output)),
-        measurable_m=measurable_limit(output),
+        beyond=beyond_limit(single_map(output.prediction), measurable_m),
+        measurable_m=measurable_m,
         uploads=tuple({path.parent for path in _files(run)}),
     )
 

@@ -64,7 +64,7 @@ FEW = FindingKind(
     "points.few",
     REMARK,
     "There are too few known depths",
-    cause="Fewer than three points are in the image, in addition to a matched second view.",
+    cause="Fewer than three points are in the image, but there is a matched second view.",
     hint="Provide at least three points.",
 )
 

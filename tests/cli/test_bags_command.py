@@ -54,13 +54,13 @@ def test_removed_depths_are_unknown_in_every_message_of_a_bag(
     bags.write_bag(tmp_path / "drive.mcap", images=(textured_plane.left, textured_plane.right))
     words = ["depth", "drive.mcap", *TOPICS, "--prior", prior, "--steps", "1", "-q", "--out"]
     assert geodiff(*words, "all.mcap").code == 0
-    most_m = float(np.nanquantile(np.load("all-frames/000000/sigma.npy"), 0.5))
-    answer = geodiff(*words, "holes.mcap", "--max-sigma", most_m, "--holes")
+    limit_m = float(np.nanquantile(np.load("all-frames/000000/sigma.npy"), 0.5))
+    answer = geodiff(*words, "holes.mcap", "--max-sigma", limit_m, "--holes")
     assert answer.code == 0, answer.err
     topics = ("/depth/image", "/depth/sigma")
     for (_, depth), (_, sigma) in zip(*(depth_images(Path("holes.mcap"), at) for at in topics), strict=True):
         np.testing.assert_array_equal(depth > 0, sigma > 0)
-        assert 0.1 < (depth > 0).mean() < 0.9 and sigma.max() <= np.ceil(1000 * most_m)
+        assert 0.1 < (depth > 0).mean() < 0.9 and sigma.max() <= np.ceil(1000 * limit_m)
 
 
 FILES = {

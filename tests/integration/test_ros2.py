@@ -76,7 +76,7 @@ def source(frames, textured_plane):
 
 @pytest.mark.parametrize("factor", [1, 2])
 def test_the_size_of_the_images_shows_whether_k_is_binned(frames, textured_plane, factor):
-    """A driver states K and size of the sensor, or those of the binned images along with the binning."""
+    """A driver states K and size of the sensor, or of the binned images along with the binning."""
     source, (width, height) = frames.MessageSource(), textured_plane.left.shape[1::-1]
     K = np.diag([factor, factor, 1]) @ textured_plane.K
     for side, baseline_m in (("left", 0.0), ("right", BASELINE_M)):

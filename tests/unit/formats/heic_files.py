@@ -64,7 +64,7 @@ def _located(iloc: bytes, more: int) -> tuple[list[int], bytes]:
 
 
 def _with_properties(iprp: bytes, further: dict[int, Sequence[bytes]]) -> bytes:
-    """The properties of a file and those of some items."""
+    """The properties of a file and of some of its items."""
     (_, ipco), (_, ipma) = boxes(iprp)
     assert ipma[:4] == bytes(4), "items of two bytes, indices of one"
     number, rows, at = len(list(boxes(ipco))), ipma[:8], 8

@@ -68,12 +68,12 @@ def printed(lens=(0.0,) * 5, sizes=(SIZE_RIGHT, (520, 350))) -> str:
         K = np.diag([1, 1, 1.0 + number]) @ K_RIGHT / (1.0 + number)  # half of the size
         text += intrinsic("Color", K, size, "YUYV/RGB8/BGR8/RGBA8/BGRA8/Y16", lens)
     text += "".join(intrinsic(f"Infrared {n}", K_LEFT, SIZE_LEFT, "Y8") for n in (1, 2))
-    beside = np.eye(4)
-    beside[0, 3] = -0.05
+    to_second = np.eye(4)
+    to_second[0, 3] = -0.05
     text += "\nExtrinsic Parameters:\n" + extrinsic("Color", "Infrared 1", E)
-    for name, between in (("Color", T), ("Infrared 1", np.eye(4)), ("Infrared 2", beside)):
+    for name, between in (("Color", T), ("Infrared 1", np.eye(4)), ("Infrared 2", to_second)):
         text += extrinsic("Infrared 1", name, between)
-    return text + extrinsic("Infrared 2", "Color", T @ np.linalg.inv(beside))
+    return text + extrinsic("Infrared 2", "Color", T @ np.linalg.inv(to_second))
 
 
 def test_the_colour_camera_of_a_realsense_is_posed_in_its_left_infrared_camera(tmp_path):
