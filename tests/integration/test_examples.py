@@ -1,6 +1,7 @@
 """Every example runs as it stands, on a tiny random prior to be quick; and the notebook."""
 
 import importlib
+import importlib.util
 import json
 import pickle
 import re
@@ -8,7 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,8 +17,10 @@ import pytest
 import torch
 from PIL import Image
 
-from examples import learned_stereo, network_poses, posed_images, proof
+from examples import learned_stereo, lerobot_depth, network_poses, posed_images, proof
 from examples.networks import psmnet
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
+from tests import lerobot_stand_in
 from tests.cli.conftest import write_pair
 from tests.contracts.tiny_priors import TINY
 from tests.evaluating import write_scenes
@@ -190,6 +193,51 @@ def test_rig_video_of_files(run, prior, pair, textured_plane):
         writer.release()
     words = "left.avi right.avi calib.txt --steps 1 --out depth.gif --frames 50 --prior".split()
     assert run("rig_video", *words, prior).count("median") == 2
+
+
+@pytest.fixture
+def lerobot(monkeypatch):
+    """LeRobot, or a stand-in if it is not installed."""
+    if importlib.util.find_spec("lerobot") is None:
+        for name in ("lerobot", "lerobot.configs", "lerobot.datasets"):
+            module = ModuleType(name)
+            module.__dict__.update(vars(lerobot_stand_in))
+            monkeypatch.setitem(sys.modules, name, module)
+
+
+@pytest.mark.usefixtures("lerobot")
+def test_depth_is_added_to_a_lerobot_dataset(run, prior):
+    pair = read_demo_pair()
+    left, right = (np.rint(image * 255).astype(np.uint8) for image in (pair.left, pair.right))
+    lerobot_depth.record(Path("recorded"), [1, 1], left, right)
+    words = ["--steps", 1, "--prior", prior, "--min-confidence", 0.9, "--out"]
+    words = ["recorded", "--calib", DEMO_PAIR_FOLDER / "calib.txt", *words]
+    said = run("lerobot_depth", *words, "video")
+    assert "episode 1, frame 1: " in said and "unknown, stored as 0.01 m" in said
+    assert "differs by at most 0.0 mm" in run("lerobot_depth", *words, "tiff", "--tiff")
+    run("lerobot_depth", *words, "near", "--max-depth", 0.5)
+    source, video, tiff, near = map(lerobot_depth.open_dataset, ("recorded", "video", "tiff", "near"))
+    assert [int(video[i]["episode_index"]) for i in range(len(video))] == [0, 1]
+    for i in range(2):
+        for key in ("observation.state", "task"):
+            assert video[i][key] == source[i][key]
+        images = [each[i]["observation.images.left"].float() for each in (source, video)]
+        assert images[1].shape == images[0].shape and (images[1] - images[0]).abs().mean() < 5
+        exact, coded, clipped = (each[i]["observation.depth"][0].numpy() for each in (tiff, video, near))
+        known = exact > 0
+        assert 0.1 < known.mean() < 1
+        assert np.median(np.abs(exact / pair.depth_m - 1)[known & pair.valid]) < 0.05
+        # Half of one of 4095 steps of log(depth + 3.5 m)
+        half_step = (exact + 3.5) * np.log(13.5 / 3.51) / 8190
+        assert (np.abs(coded - exact) < half_step + 1e-5)[known].all()
+        np.testing.assert_allclose(coded[~known], 0.01, atol=1e-5)
+        np.testing.assert_allclose(clipped[known], 0.5, atol=1e-5)
+
+
+def test_lerobot_example_needs_a_calibration(run, prior, capsys):
+    with pytest.raises(SystemExit):
+        run("lerobot_depth", "recorded", "--prior", prior)
+    assert "expected a dataset and its calibration" in capsys.readouterr().err
 
 
 def test_poses_of_networks_are_a_capture(run, tmp_path):
