@@ -41,9 +41,9 @@ def valid_depth(folder: Path) -> np.ndarray:
     return depth_m * (np.load(confidence, allow_pickle=False) > 0) if confidence.is_file() else depth_m
 
 
-def known_sigma(folder: Path) -> np.ndarray | None:
+def known_sigma(folder: Path, name: str = "sigma.npy") -> np.ndarray | None:
     """Read the standard deviation of a result's depth, ``(H, W)`` metres; ``None`` if it has none."""
-    path = folder / "sigma.npy"
+    path = folder / name
     return np.load(path, allow_pickle=False) if path.is_file() else None
 
 

@@ -12,15 +12,21 @@ from typing import Any
 import numpy as np
 
 from geodiff_plugin._internal.checks import InputError
-from geodiff_plugin.capture.results import AGREED, ALONE, FinishedFrame, write_smoothed
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.capture.results import AGREED, ALONE, FIGURES, FinishedFrame, write_smoothed
 from geodiff_plugin.findings import some_names
 from geodiff_plugin.formats import REPORT, reason_of, write_text
 from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef, options_of
 from geodiff_plugin.jobs.reading import read_pair
-from geodiff_plugin.jobs.report import read_report, valid_depth
-from geodiff_plugin.jobs.writing import thresholds, write_reprojected
+from geodiff_plugin.jobs.report import known_sigma, read_report, valid_depth
+from geodiff_plugin.jobs.writing import (
+    DEPTH_REPROJECTED,
+    SIGMA_REPROJECTED,
+    thresholds,
+    write_reprojected,
+)
 
 
 @dataclass
@@ -36,9 +42,9 @@ class _Result:
         return FinishedFrame(self.folder, np.reshape(self.report["K"], (3, 3)), self.report["unit"])
 
     def add(self, names: Iterable[str], **entries: Any) -> None:
-        """Add maps to the files listed in the report, so that a later run with --overwrite replaces them."""
+        """Add files to those listed in the report, so that a later run with --overwrite replaces them."""
         files = self.report["files"]
-        files["names"] = sorted({*files["names"], *(f"{name}.npy" for name in names)})
+        files["names"] = sorted({*files["names"], *names})
         write_text(self.folder / REPORT, json.dumps(self.report | entries, indent=2) + "\n")
 
 
@@ -64,7 +70,7 @@ def write_smoothed_frames(
     results = [_Result(folder, read_report(folder)) for folder in folders]
 
     def image(i: int) -> np.ndarray:
-        results[i].add(ALONE)
+        results[i].add(f"{name}.npy" for name in ALONE)
         return read_pair(options_of(refs[i], options), frames_of(refs[i]), packing=refs[i].packing).left
 
     try:
@@ -73,12 +79,14 @@ def write_smoothed_frames(
             holes = thresholds(options) if options.holes else None
             scenes = write_smoothed([result.frame for result in results], image, holes)
         for result, scene in zip(results, scenes, strict=True):
+            names = [*(f"{name}.npy" for name in AGREED), *FIGURES]
             if options.reproject is not None:
-                depth = valid_depth(result.folder)
+                maps = valid_depth(result.folder), known_sigma(result.folder)
                 result.report["reproject"] = write_reprojected(
-                    result.folder, depth, result.frame.K, options.target_camera()
+                    result.folder, *maps, Camera(result.frame.K), options.target_camera()
                 )
-            result.add(AGREED, temporal_smoothing={"scene": scene})
+                names += DEPTH_REPROJECTED + SIGMA_REPROJECTED
+            result.add(names, temporal_smoothing={"scene": scene})
     except OSError as error:
         raise InputError(
             f"--temporal-smoothing failed ({reason_of(error)}). Run the same command again to resume."

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin import formats, plotting
-from geodiff_plugin._internal.reprojection import depth_in_camera
+from geodiff_plugin._internal.reprojection import maps_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
 from geodiff_plugin.capture.results import Thresholds
 from geodiff_plugin.evidence.guidance import GeometryGuidance
@@ -21,8 +21,9 @@ from geodiff_plugin.jobs.records import PairInputs, PairResult, PairRun
 from geodiff_plugin.jobs.report import build_report, measured_depth, report_text, single_map, used_poses
 from geodiff_plugin.result.output import MetricDepthOutput
 
-#: Files with the depth in the camera of ``--reproject``, in metres (float) and whole millimetres.
-REPROJECTED_FILES = ("depth_reprojected.npy", "depth_reprojected_mm.png")
+#: Files with depth and sigma in the camera of ``--reproject``, each in metres (float) and whole millimetres.
+DEPTH_REPROJECTED = ("depth_reprojected.npy", "depth_reprojected_mm.png")
+SIGMA_REPROJECTED = ("sigma_reprojected.npy", "sigma_reprojected_mm.png")
 
 
 def write_pair(folder: OutFolder | HeldFolder, run: PairRun, max_points: int | None = None) -> PairResult:
@@ -44,8 +45,11 @@ def write_pair(folder: OutFolder | HeldFolder, run: PairRun, max_points: int | N
                 write_undistorted(place, inputs.left)
             if options.reproject is not None:
                 depth_m = single_map(output.prediction * output.valid)
-                K = np.asarray(output.K)[0].astype(np.float64)
-                report["reproject"] = write_reprojected(place, depth_m, K, options.target_camera())
+                sigma_m = None if output.sigma is None else single_map(output.sigma)
+                camera = Camera(np.asarray(output.K)[0].astype(np.float64))
+                report["reproject"] = write_reprojected(
+                    place, depth_m, sigma_m, camera, options.target_camera()
+                )
             if options.export:
                 write_exports(place, output, inputs, options, max_points)
         report["files"]["names"] = [*sorted(path.name for path in place.iterdir()), REPORT]
@@ -178,17 +182,20 @@ def _save_figure(figure: Image.Image, path: Path) -> Image.Image:
 
 
 def write_reprojected(
-    folder: Path, depth_m: np.ndarray, K: np.ndarray, camera: PosedCamera
+    folder: Path, depth_m: np.ndarray, sigma_m: np.ndarray | None, camera: Camera, other: PosedCamera
 ) -> dict[str, Any]:
-    """Write a depth map ``(H, W)`` in the camera of ``--reproject``; return its report entry."""
-    seen_m = depth_in_camera(depth_m, Camera(K), camera)
-    formats.write_depth_npy(folder / REPROJECTED_FILES[0], seen_m)
-    formats.write_depth_mm(folder / REPROJECTED_FILES[1], seen_m)
+    """Write depth and sigma ``(H, W)`` as the camera of ``--reproject`` sees them; return a report entry."""
+    seen_m, sigma_seen_m = maps_in_camera(depth_m, sigma_m, camera, other)
+    formats.write_depth_npy(folder / DEPTH_REPROJECTED[0], seen_m)
+    formats.write_depth_mm(folder / DEPTH_REPROJECTED[1], seen_m)
+    if sigma_seen_m is not None:
+        formats.write_depth_npy(folder / SIGMA_REPROJECTED[0], sigma_seen_m)
+        formats.write_sigma_mm(folder / SIGMA_REPROJECTED[1], sigma_seen_m)
     known = round(float((seen_m > 0).mean()), 4)
     return {
-        "K": camera.K.tolist(),
-        "E": camera.E.tolist(),
-        "size": list(camera.size),
+        "K": other.K.tolist(),
+        "E": other.E.tolist(),
+        "size": list(other.size),
         "known_fraction": known,
     }
 

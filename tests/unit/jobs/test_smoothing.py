@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin._internal.checks import InputError
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.jobs import smoothing
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef
@@ -38,6 +39,7 @@ def run(tmp_path, monkeypatch):
             confidence[5:7] = 0.0
             np.save(frame.folder / "depth.npy", made_runs.depth_map() + n + 0.1)
             np.save(frame.folder / "confidence.npy", confidence)
+            np.save(frame.folder / "sigma.npy", np.where(confidence > 0, 0.2, np.nan).astype(np.float32))
         return asked["scenes"][: len(frames)]
 
     def read_pair(options, views, packing=None):
@@ -91,9 +93,13 @@ def test_another_camera_sees_the_averaged_depth_where_there_is_one(run, tmp_path
         known = made_runs.depth_map() + n + 0.1
         known[5:7] = 0.0
         K = made_runs.K_LEFT + n * np.diag([1.0, 1.0, 0])
-        reported = write_reprojected(tmp_path, known, K, run["options"].target_camera())
-        np.testing.assert_array_equal(seen_m, np.load(tmp_path / "depth_reprojected.npy"))
-        assert json.loads((folder / "report.json").read_text())["reproject"] == reported
+        sigma_m = np.load(folder / "sigma.npy")
+        reported = write_reprojected(tmp_path, known, sigma_m, Camera(K), run["options"].target_camera())
+        for name in ("depth_reprojected.npy", "sigma_reprojected.npy"):
+            np.testing.assert_array_equal(np.load(folder / name), np.load(tmp_path / name))
+        report = json.loads((folder / "report.json").read_text())
+        assert report["reproject"] == reported
+        assert {"depth_reprojected.npy", "sigma_reprojected_mm.png"} <= set(report["files"]["names"])
         millimetres = np.asarray(Image.open(folder / "depth_reprojected_mm.png"))
         np.testing.assert_array_equal(millimetres > 0, seen_m > 0)
 
