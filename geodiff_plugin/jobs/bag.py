@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._internal.checks import bad_value
-from geodiff_plugin.formats import check_new_file, frame_of_target, recordings, write_text
+from geodiff_plugin.formats import check_new_file, frame_of_target, read_report, recordings, write_text
 from geodiff_plugin.jobs.camera_sources import given_camera_options
 from geodiff_plugin.jobs.finished import Row
 from geodiff_plugin.jobs.many import depth_pairs
 from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import start_many
-from geodiff_plugin.jobs.report import known_sigma, read_report, valid_depth
+from geodiff_plugin.jobs.report import known_sigma, valid_depth
 from geodiff_plugin.jobs.writing import DEPTH_REPROJECTED, SIGMA_REPROJECTED
 
 

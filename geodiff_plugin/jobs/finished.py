@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin.formats import read_report
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import file_digests
-from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.settings import Affects, settings_of
 
 Row = dict[str, Any]

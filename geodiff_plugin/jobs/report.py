@@ -13,9 +13,9 @@ import torch
 
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.findings import Severity, as_records
-from geodiff_plugin.formats import REPORT
 from geodiff_plugin.jobs.records import PairRun
 from geodiff_plugin.result.output import MetricDepthOutput
+from geodiff_plugin.result.readings import beyond_limit, measured
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.trust import (
     UNTESTED,
@@ -23,15 +23,6 @@ from geodiff_plugin.trust import (
     MatchedFraction,
     summary_words,
 )
-
-
-def read_report(folder: Path) -> dict[str, Any]:
-    """Read the report of a result; empty if it is missing or unreadable."""
-    try:
-        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return report if isinstance(report, dict) else {}
 
 
 def valid_depth(folder: Path) -> np.ndarray:
@@ -69,16 +60,9 @@ def measurable_limit(output: MetricDepthOutput) -> float | None:
     return None if output.measurable_m is None else float(output.measurable_m[0])
 
 
-def beyond_limit(depth_m: np.ndarray, measurable_m: float | None) -> np.ndarray:
-    """Return the mask ``(H, W)`` of depths that are too far to be measured, as in the sky."""
-    return np.isfinite(depth_m) & (depth_m > (math.inf if measurable_m is None else measurable_m))
-
-
 def measured_depth(output: MetricDepthOutput) -> np.ndarray:
     """Return the depth of an output with one image, ``(H, W)``; 0 where it is invalid or too far."""
-    depth_m = single_map(output.prediction)
-    measured = single_map(output.valid) & ~beyond_limit(depth_m, measurable_limit(output))
-    return np.where(measured, depth_m, 0.0)
+    return measured(single_map(output.prediction), single_map(output.valid), measurable_limit(output))
 
 
 def depth_summary(
@@ -96,14 +80,12 @@ def depth_summary(
     has_depth = np.isfinite(depth_m) & (depth_m > 0)
     valid = has_depth if valid is None else has_depth & valid
     beyond = beyond_limit(depth_m, measurable_m)
-    kept, measured = (
-        depth_m[mask] if mask.any() else np.array([math.nan]) for mask in (valid, valid & ~beyond)
-    )
+    kept, near = (depth_m[mask] if mask.any() else np.array([math.nan]) for mask in (valid, valid & ~beyond))
     return {
         "min_m": float(kept.min()),
         "median_m": float(np.median(kept)),
         "mean_m": float(kept.mean()),
-        "max_m": float(measured.max()),
+        "max_m": float(near.max()),
         "beyond_m": measurable_m if beyond.any() else None,
         "beyond_fraction": float(beyond.mean()),
         "width": depth_m.shape[1],
@@ -171,6 +153,7 @@ def build_report(run: PairRun) -> dict[str, Any]:
     known = None if sigma is None else sigma[np.isfinite(sigma)]
     report = {
         "depth": output_summary(output),
+        "measurable_m": measurable_limit(output),
         "verdict": verdict_report(output),
         "photometric_error_mean": error,
         "sigma_median_m": None if known is None or not known.size else np.median(known),

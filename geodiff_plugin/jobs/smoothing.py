@@ -15,12 +15,12 @@ from geodiff_plugin._internal.checks import InputError
 from geodiff_plugin.cameras import Camera
 from geodiff_plugin.capture.results import AGREED, ALONE, FIGURES, FinishedFrame, write_smoothed
 from geodiff_plugin.findings import some_names
-from geodiff_plugin.formats import REPORT, reason_of, write_text
+from geodiff_plugin.formats import REPORT, read_report, reason_of, write_text
 from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef, options_of
 from geodiff_plugin.jobs.reading import read_pair
-from geodiff_plugin.jobs.report import known_sigma, read_report, valid_depth
+from geodiff_plugin.jobs.report import known_sigma, valid_depth
 from geodiff_plugin.jobs.writing import (
     DEPTH_REPROJECTED,
     SIGMA_REPROJECTED,

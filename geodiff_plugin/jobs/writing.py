@@ -161,8 +161,7 @@ def write_previews(
 
 def figure_range(output: MetricDepthOutput) -> tuple[float, float]:
     """Return the depths at the ends of a figure's colours; depths that were not measured do not count."""
-    measured_m = measured_depth(output)
-    return plotting.depth_range(measured_m if (measured_m > 0).any() else single_map(output.prediction))
+    return plotting.measured_range(measured_depth(output), single_map(output.prediction))
 
 
 def _thinned(kept: np.ndarray, max_points: int | None) -> np.ndarray:

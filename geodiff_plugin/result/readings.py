@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -75,6 +76,19 @@ def distance_m(a: Reading, b: Reading) -> tuple[float, float | None]:
         return 0.0, float(np.hypot(a.spread, b.spread) * np.linalg.norm(a.point_m))
     of_a, of_b = between @ a.point_m * a.spread, between @ b.point_m * b.spread
     return length, float(np.hypot(of_a, of_b) / length)
+
+
+def beyond_limit(depth: np.ndarray, measurable: float | None) -> np.ndarray:
+    """Return the mask ``(H, W)`` of depths that are too far to be measured, as in the sky.
+
+    ``measurable`` is the farthest measurable depth, in the unit of ``depth``; ``None`` if unknown.
+    """
+    return np.isfinite(depth) & (depth > (math.inf if measurable is None else measurable))
+
+
+def measured(depth: np.ndarray, valid: np.ndarray, measurable: float | None) -> np.ndarray:
+    """Return a depth map ``(H, W)`` with 0 where it is not ``valid (H, W)`` or too far to be measured."""
+    return np.where(valid & ~beyond_limit(depth, measurable), depth, 0.0)
 
 
 def metres(value: float, spread: float | None = None, unit: str | None = "m") -> str:
