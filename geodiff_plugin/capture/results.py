@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -168,27 +168,40 @@ def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
 
 
 class FinishedFrame(NamedTuple):
-    """A processed frame of a video."""
+    """A processed frame of a video or a capture."""
 
     folder: Path
     K: np.ndarray  # (3, 3) in pixels of its maps
     unit: str | None  # unit of its depth
 
+    @classmethod
+    def of(cls, folder: Path, report: Mapping[str, Any]) -> Self:
+        """Return the frame of a folder with its report."""
+        return cls(folder, np.reshape(report["K"], (3, 3)), report["unit"])
+
+    def read(self, maps: Mapping[str, str] = AGREED) -> DepthFrame:
+        """Read maps by their fields of ``DepthFrame``, in the camera's own frame."""
+        loaded = _loaded(self.folder, maps)
+        camera = PosedCamera(self.K, loaded["depth"].shape[::-1], E=np.eye(4))
+        return DepthFrame(self.folder.name, camera=camera, measurable=_measurable(self.folder), **loaded)
+
 
 def write_smoothed(
     frames: Sequence[FinishedFrame], rgb: Callable[[int], np.ndarray], holes: Thresholds | None = None
-) -> list[int]:
-    """Write the temporally smoothed depth of a video's finished frames; return the scene number of each.
+) -> Iterator[tuple[int, DepthFrame]]:
+    """Write the temporally smoothed depth of a video's finished frames.
 
     ``rgb(i)`` is ``(H, W, 3)`` in [0, 1]. The depth before smoothing stays in ``ALONE``, so repeating the
-    call changes nothing. With ``holes``, depths that are not reliable after smoothing are removed.
+    call changes nothing. With ``holes``, depths that are not reliable after smoothing are removed. After each
+    frame is written, yields the number of its scene and its maps.
     """
     scenes = scene_poses((_alone(frame), rgb(i)) for i, frame in enumerate(frames))
     averaged = temporally_smoothed(scenes, lambda i: _alone(frames[i]))
-    for frame, smoothed in zip(frames, averaged, strict=True):
+    numbers = [number for number, poses in enumerate(scenes) for _ in poses]
+    for frame, number, smoothed in zip(frames, numbers, averaged, strict=True):
         shown = smoothed if holes is None else with_holes(smoothed, holes)
         _write_agreed(frame.folder, shown, frame.unit)
-    return [number for number, poses in enumerate(scenes) for _ in poses]
+        yield number, shown
 
 
 def save_alone(
@@ -227,9 +240,7 @@ def _alone(frame: FinishedFrame) -> DepthFrame:
         paths = [folder / f"{name}.npy" for name in ("confidence", "sigma")]
         further = [np.load(path) if path.is_file() else None for path in paths]
         save_alone(folder, np.load(folder / "depth.npy"), *further)
-    maps = _loaded(folder, ALONE)
-    camera = PosedCamera(frame.K, maps["depth"].shape[::-1], E=np.eye(4))
-    return DepthFrame(folder.name, camera=camera, measurable=_measurable(folder), **maps)
+    return frame.read(ALONE)
 
 
 def write_results(

@@ -13,7 +13,7 @@ import torch
 
 from geodiff_plugin import __version__
 from geodiff_plugin.capture.frames import Capture
-from geodiff_plugin.capture.results import ALONE, read_agreed, save_alone
+from geodiff_plugin.capture.results import ALONE, FinishedFrame, save_alone
 from geodiff_plugin.findings import as_records
 from geodiff_plugin.formats import (
     MAP_SUFFIXES,
@@ -138,10 +138,11 @@ def write_agreed_frame(capture: Capture, name: str, folder: Path) -> Record:
 
     Returns the entries of the report that changed.
     """
-    depth, confidence, sigma = read_agreed(folder)
     report = read_report(folder)
-    points = write_previews(folder, capture.image(name), depth, confidence, sigma, report)
-    changed = {"depth": _percentiles(depth), "files": report["files"] | {"cloud_points": points}}
+    frame = FinishedFrame.of(folder, report)
+    maps = frame.read()
+    counts = write_previews(frame, maps, capture.image(name))
+    changed = {"depth": _percentiles(maps.depth), "files": report["files"] | counts}
     write_text(folder / REPORT, json.dumps(report | changed, indent=2) + "\n")
     return changed
 

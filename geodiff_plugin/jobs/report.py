@@ -23,6 +23,7 @@ from geodiff_plugin.trust import (
     MatchedFraction,
     summary_words,
 )
+from geodiff_plugin.types import DepthFrame
 
 
 def valid_depth(folder: Path) -> np.ndarray:
@@ -95,6 +96,32 @@ def depth_summary(
     }
 
 
+def smoothed_entries(report: dict[str, Any], frame: DepthFrame) -> dict[str, Any]:
+    """Return the entries of a frame's report that describe its maps after temporal smoothing.
+
+    ``temporal_smoothing.alone`` keeps the entries of the frame's own result, also if smoothing is repeated.
+    """
+    names = ("depth", "sigma_median_m")
+    alone = report.get("temporal_smoothing", {}).get("alone") or {name: report[name] for name in names}
+    known = frame.depth > 0
+    depth = depth_summary(frame.depth, None, frame.confidence > 0, frame.measurable)
+    entries = {
+        "depth": depth | {"visible_fraction": alone["depth"]["visible_fraction"]},
+        "sigma_median_m": median_sigma(frame.sigma),
+        "temporal_smoothing": {
+            "confidence_mean": float(frame.confidence[known].mean()) if known.any() else 0.0,
+            "alone": alone,
+        },
+    }
+    return plain(entries)
+
+
+def median_sigma(sigma_m: np.ndarray | None) -> float | None:
+    """Return the median of the known standard deviations ``(H, W)``; ``None`` if there are none."""
+    known = np.zeros(0) if sigma_m is None else sigma_m[np.isfinite(sigma_m)]
+    return float(np.median(known)) if known.size else None
+
+
 def plain(value: Any) -> Any:
     """Convert tensors and arrays to lists, and non-finite numbers to ``None``, for JSON."""
     if isinstance(value, dict):
@@ -149,14 +176,12 @@ def build_report(run: PairRun) -> dict[str, Any]:
         error = float(single_map(output.photometric_error)[visible].mean()) if visible.any() else math.nan
     spread = output.uncertainty
     names = ("K", "scale", "shift", "global_scale", "prior_scale", "prior_error", "unit")
-    sigma = None if output.sigma is None else single_map(output.sigma)
-    known = None if sigma is None else sigma[np.isfinite(sigma)]
     report = {
         "depth": output_summary(output),
         "measurable_m": measurable_limit(output),
         "verdict": verdict_report(output),
         "photometric_error_mean": error,
-        "sigma_median_m": None if known is None or not known.size else np.median(known),
+        "sigma_median_m": median_sigma(None if output.sigma is None else single_map(output.sigma)),
         "uncertainty_median_m": None if spread is None else np.median(single_map(spread)),
         **{name: getattr(output, name) for name in names},
         "history": [vars(step) for step in output.history],

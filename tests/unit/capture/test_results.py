@@ -478,9 +478,16 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
     """Depth by a run is kept on first use. The second scene has a frame more than the first."""
     frames, images, ground_truths = finished_video(tmp_path)
     before = [np.load(frame.folder / "depth.npy") for frame in frames]
-    assert results.write_smoothed(frames, images.__getitem__) == [0, 0, 1, 1, 1]
+    written_maps = []
+    for i, (scene, maps) in enumerate(results.write_smoothed(frames, images.__getitem__)):
+        assert scene == (i > 1)
+        written_maps.append(maps)
     temporal_smoothing = [np.load(frame.folder / "depth.npy") for frame in frames]
     for i, frame in enumerate(frames):
+        for name in ("depth", "confidence", "sigma", "confirmed", "observers"):
+            np.testing.assert_array_equal(
+                np.load(frame.folder / f"{name}.npy"), getattr(written_maps[i], name)
+            )
         np.testing.assert_array_equal(np.load(frame.folder / "depth_alone.npy"), before[i])
         sure = np.load(frame.folder / "confidence_alone.npy")
         np.testing.assert_array_equal(sure, np.full(sure.shape, 0.1 + 0.2 * i if i else 0.5, np.float32))
@@ -491,7 +498,7 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
         ]
         assert off[0] < 0.8 * off[1]
         assert np.median(np.load(frame.folder / "observers.npy")[middle]) == (1 if i < 2 else 2)
-    results.write_smoothed(frames, images.__getitem__)
+    list(results.write_smoothed(frames, images.__getitem__))
     for frame, depth in zip(frames, temporal_smoothing, strict=True):
         np.testing.assert_array_equal(np.load(frame.folder / "depth.npy"), depth)
 
@@ -516,10 +523,10 @@ def test_depths_that_are_not_reliable_after_smoothing_are_removed(plain_figures,
         depth, sigma = (np.load(frame.folder / f"{name}.npy") for name in ("depth", "sigma"))
         return (depth > 0) & ~(sigma <= limits.max_sigma)
 
-    results.write_smoothed(frames, images.__getitem__)
+    list(results.write_smoothed(frames, images.__getitem__))
     assert above(frames[3])[blob].mean() > 0.9, "smoothing alone violates the limit"
     kept = [~above(frame) for frame in frames]
-    results.write_smoothed(frames, images.__getitem__, limits)
+    list(results.write_smoothed(frames, images.__getitem__, limits))
     for frame, mask in zip(frames, kept, strict=True):
         maps = {name: np.load(frame.folder / f"{name}.npy") for name in ("depth", "confidence", "sigma")}
         np.testing.assert_array_equal(maps["depth"] > 0, mask)
@@ -771,11 +778,11 @@ def test_the_colours_of_a_frame_end_at_its_farthest_measured_depth(finished, tmp
     (folder / "report.json").write_text('{"measurable_m": 70.0}')
     results.save_alone(folder, depth, confidence, np.full_like(depth, 0.1))
     image = np.random.default_rng(0).random((40, 50, 3), np.float32)
-    results.write_smoothed([FinishedFrame(folder, KS[0], "m")], lambda i: image)
+    list(results.write_smoothed([FinishedFrame(folder, KS[0], "m")], lambda i: image))
     ((_, near, far),) = drawn
     np.testing.assert_allclose((near, far), np.percentile(depth[14:], (2, 98)))
     (folder / "report.json").write_text('{"measurable_m": 0.5}')  # nothing can be measured
-    results.write_smoothed([FinishedFrame(folder, KS[0], "m")], lambda i: image)
+    list(results.write_smoothed([FinishedFrame(folder, KS[0], "m")], lambda i: image))
     np.testing.assert_allclose(drawn[-1][1:], np.percentile(depth, (2, 98)))
 
 
