@@ -143,6 +143,7 @@ class DepthFrame:
     confirmed: np.ndarray | None = None  # (H, W) number of other frames that agree with the depth
     observers: np.ndarray | None = None  # (H, W) number that see the point or something in front
     sigma: np.ndarray | None = None  # (H, W) standard deviation of the depth; NaN where unknown
+    measurable: float | None = None  # the farthest depth that its views can measure; None if unknown
 
     def world(self) -> np.ndarray:
         """Unproject the pixels to points ``(H, W, 3)`` in the world frame."""

@@ -1,8 +1,9 @@
-"""Reproject the depth of one camera into another one by z-buffered forward warping of its surfaces."""
+"""Reproject the maps of one camera into another one by z-buffered forward warping of its surfaces."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,28 +27,80 @@ STEPS = 3
 MAX_STEP_FRACTION = 0.05
 
 
-def depth_in_camera(depth: np.ndarray, camera: Camera, other: PosedCamera) -> np.ndarray:
-    """Compute the depth ``(h, w)`` float32 along z of another camera, in the same unit; 0 for no depth.
+class _Samples(NamedTuple):
+    """Samples of a surface, projected into the other camera."""
+
+    px: np.ndarray  # (n, 2) in the other camera
+    z: np.ndarray  # (n,) depth in the other camera
+    source: np.ndarray  # (n,) flat index of the nearest pixel of the first camera
+
+
+def maps_in_camera(
+    depth: np.ndarray, sigma: np.ndarray | None, camera: Camera, other: PosedCamera
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Compute a depth map and its standard deviation as another camera sees them, in the same unit.
 
     Every cell of four pixels of ``depth (H, W)`` on one surface (``JUMP``) is filled, so that a camera with a
     higher resolution has no holes. If several surfaces project to a pixel, the nearest one wins. Regions that
     are occluded in the first camera, outside its image, or unknown have no depth.
+
+    An error of the depth ``z`` moves a point along its ray ``r``, with ``r_z = 1``. Its depth along the other
+    camera's z axis ``e`` therefore changes by ``e . r`` times the error, about 1 for nearly parallel cameras,
+    and so does its standard deviation. This is the uncertainty of the point; it does not include that the
+    point also moves to another pixel of the other camera.
+
+    Args:
+        depth: ``(H, W)`` along z of the first camera; 0 or not finite where unknown.
+        sigma: ``(H, W)`` standard deviation of ``depth``; NaN where unknown, ``None`` if there is none.
+        camera: the first camera.
+        other: the other camera, with its size and its pose in the first camera's frame.
+
+    Returns:
+        Depth ``(h, w)`` float32 along z of the other camera, 0 for no depth, and its standard deviation
+        ``(h, w)`` float32 at the winning points, NaN where it is unknown or there is no depth.
+    """
+    width, height = other.size
+    inverse = _inverse(depth)
+    nearest, source = (each.reshape(height, width) for each in _z_buffer(inverse, camera, other))
+    depth_seen = np.empty((height, width), np.float32)
+    for rows in row_strips(height, width):
+        depth_seen[rows] = _at_centres(nearest[rows], rows.start, inverse, camera, other)
+    if sigma is None:
+        return depth_seen, None
+    sigma_seen = np.empty((height, width), np.float32)
+    for rows in row_strips(height, width):
+        sigma_seen[rows] = _sigma_along_z(sigma, source[rows], camera, other)
+    return depth_seen, sigma_seen
+
+
+def _z_buffer(inverse: np.ndarray, camera: Camera, other: PosedCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nearest depth ``(h * w,)`` in the pixels of the other camera, and its source.
+
+    The depth is infinite and the source -1 in pixels without a sample.
     """
     width, height = other.size
     nearest = np.full(width * height, np.inf)
-    inverse = _inverse(depth)
-    for rows in row_strips(*depth.shape):
-        for px, z in _samples(inverse, rows, camera, other):
-            inside = other.contains(px)
-            column, row = (np.rint(at[inside]).astype(np.int64) for at in px.T)
-            cells = torch.from_numpy(row * width + column)
-            z_inside = torch.from_numpy(z[inside])
-            keep_nearest(torch.from_numpy(nearest), cells, z_inside)
-    seen = nearest.reshape(height, width)
-    result = np.zeros((height, width), np.float32)
-    for rows in row_strips(height, width):
-        result[rows] = _at_centres(seen[rows], rows.start, inverse, camera, other)
-    return result
+    source = np.full(width * height, -1)
+    for rows in row_strips(*inverse.shape):
+        for samples in _samples(inverse, rows, camera, other):
+            inside = other.contains(samples.px)
+            column, row = (np.rint(at[inside]).astype(np.int64) for at in samples.px.T)
+            cells, z = row * width + column, samples.z[inside]
+            before = nearest[cells]
+            keep_nearest(torch.from_numpy(nearest), torch.from_numpy(cells), torch.from_numpy(z))
+            wins = (z < before) & (z == nearest[cells])  # the first of equal depths, often the pixel itself
+            source[cells[wins]] = samples.source[inside][wins]
+    return nearest, source
+
+
+def _sigma_along_z(sigma: np.ndarray, source: np.ndarray, camera: Camera, other: PosedCamera) -> np.ndarray:
+    """Return the standard deviations of depth along the other camera's z for a strip of ``source (r, w)``."""
+    known = source >= 0
+    row, column = np.divmod(source[known], sigma.shape[1])
+    along_z = np.abs(camera.rays(joined(column, row)) @ other.E[:3, 2])
+    found = np.full(source.shape, np.nan)
+    found[known] = sigma[row, column] * along_z
+    return found
 
 
 def _inverse(depth: np.ndarray) -> np.ndarray:
@@ -62,23 +115,23 @@ def _is_surface(*corners: np.ndarray) -> np.ndarray:
     return (smallest > 0) & (largest <= (1.0 + JUMP) * smallest)
 
 
-def _samples(
-    inverse: np.ndarray, rows: slice, camera: Camera, other: PosedCamera
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield pixels ``(n, 2)`` and depths ``(n,)`` in the other camera of samples of a strip of the surface.
+def _samples(inverse: np.ndarray, rows: slice, camera: Camera, other: PosedCamera) -> Iterator[_Samples]:
+    """Yield samples of a strip of the surface.
 
     The first samples are the known pixels. The others subdivide each cell of four pixels on one surface,
     whose inverse depth is interpolated bilinearly.
     """
     strip = inverse[rows.start : rows.stop + 1]  # includes the row below, which the last cells need
     own = strip[: rows.stop - rows.start]
+    width = inverse.shape[1]
     y, x = np.nonzero(own > 0)
-    yield _seen(joined(x, y + rows.start), own[y, x], camera, other)
+    pixel = (y + rows.start) * width + x
+    yield _Samples(*_seen(joined(x, y + rows.start), own[y, x], camera, other), pixel)
     corners_of_cells = strip[:-1, :-1], strip[:-1, 1:], strip[1:, :-1], strip[1:, 1:]
     y, x = np.nonzero(_is_surface(*corners_of_cells))
     if not len(y):
         return
-    px = joined(x, y + rows.start)
+    px, pixel = joined(x, y + rows.start), (y + rows.start) * width + x
     corners = [part[y, x] for part in corners_of_cells]
     count = _samples_per_side(px, corners, camera, other)
     for down in range(count):
@@ -86,7 +139,8 @@ def _samples(
             if down or right:  # (0, 0) is the pixel itself
                 s, t = right / count, down / count
                 weights = ((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t)
-                yield _seen(px + (s, t), np.tensordot(weights, corners, 1), camera, other)
+                seen = _seen(px + (s, t), np.tensordot(weights, corners, 1), camera, other)
+                yield _Samples(*seen, pixel + round(t) * width + round(s))
 
 
 def _samples_per_side(px: np.ndarray, corners: list[np.ndarray], camera: Camera, other: PosedCamera) -> int:

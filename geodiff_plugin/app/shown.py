@@ -15,7 +15,6 @@ from geodiff_plugin.formats import MM_PER_METRE, REPORT, flying_points, in_8_bit
 from geodiff_plugin.jobs import (
     PairResult,
     PairRun,
-    beyond_limit,
     cameras_of,
     depth_range_words,
     measurable_limit,
@@ -23,7 +22,7 @@ from geodiff_plugin.jobs import (
     output_summary,
     single_map,
 )
-from geodiff_plugin.result.readings import Reading, distance_m, read_pixel
+from geodiff_plugin.result.readings import Reading, beyond_limit, distance_m, read_pixel
 from geodiff_plugin.trust import KINDS, Tone, TrustSummary, summarise
 
 Pixels = list[tuple[int, int]]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -25,6 +25,7 @@ from geodiff_plugin.formats import (
     atomic_path,
     files_of_report,
     flying_points,
+    read_report,
     save_png,
     write_colmap,
     write_depth_mm,
@@ -35,6 +36,7 @@ from geodiff_plugin.formats import (
     write_vertices,
 )
 from geodiff_plugin.pose.multiview import Observations
+from geodiff_plugin.result.readings import measured
 from geodiff_plugin.types import DepthFrame
 
 #: Files with a frame's maps before the agreement check, which reads them again when repeated, and their
@@ -52,6 +54,8 @@ ON_SHEET = 24
 GLB_POINTS = 400_000
 #: Size in pixels of the video, whose frames show an image and its depth side by side.
 VIDEO_SIZE = (1280, 480)
+#: Distance between the rows and columns whose pixels determine the colours of the video and the sheet.
+RANGE_EVERY = 8
 #: Frames per second, slow enough to look at each.
 VIDEO_FPS = 5.0
 #: Side of a cell relative to the median depth; points in one cell are merged.
@@ -74,12 +78,20 @@ VERTEX = (*"xyz", "nx", "ny", "nz", "red", "green", "blue", "sigma")
 
 def _frame(capture: Capture, out: Path, maps: Mapping[str, str], name: str) -> DepthFrame:
     """Read a frame of a run on demand, because the frames of a long capture exceed the memory."""
-    return DepthFrame(name, camera=capture.camera(name), **_loaded(out / name, maps))
+    folder = out / name
+    maps_by_field = _loaded(folder, maps)
+    return DepthFrame(name, camera=capture.camera(name), measurable=_measurable(folder), **maps_by_field)
 
 
 def _loaded(folder: Path, maps: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Read maps of a frame by their fields of ``DepthFrame``."""
     return {field: np.load(folder / f"{file}.npy") for file, field in maps.items()}
+
+
+def _measurable(folder: Path) -> float | None:
+    """Return the farthest depth that the views of a frame can measure, from its report."""
+    measurable: float | None = read_report(folder).get("measurable_m")
+    return measurable
 
 
 class Thresholds(NamedTuple):
@@ -143,7 +155,10 @@ def write_agreement(
 def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
     write_depth_npy(folder / "depth.npy", frame.depth)
     write_depth_mm(folder / "depth_mm.png", frame.depth * (frame.confidence > 0))
-    save_png(plotting.depth_figure(frame.depth, unit=unit), folder / "depth.png")
+    near, far = plotting.measured_range(
+        measured(frame.depth, frame.confidence > 0, frame.measurable), frame.depth
+    )
+    save_png(plotting.depth_figure(frame.depth, near, far, unit=unit), folder / "depth.png")
     assert frame.sigma is not None  # saved with every frame
     write_sigma_mm(folder / "sigma_mm.png", frame.sigma)
     for file, field in AGREED.items():
@@ -153,27 +168,40 @@ def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
 
 
 class FinishedFrame(NamedTuple):
-    """A processed frame of a video."""
+    """A processed frame of a video or a capture."""
 
     folder: Path
     K: np.ndarray  # (3, 3) in pixels of its maps
     unit: str | None  # unit of its depth
 
+    @classmethod
+    def of(cls, folder: Path, report: Mapping[str, Any]) -> Self:
+        """Return the frame of a folder with its report."""
+        return cls(folder, np.reshape(report["K"], (3, 3)), report["unit"])
+
+    def read(self, maps: Mapping[str, str] = AGREED) -> DepthFrame:
+        """Read maps by their fields of ``DepthFrame``, in the camera's own frame."""
+        loaded = _loaded(self.folder, maps)
+        camera = PosedCamera(self.K, loaded["depth"].shape[::-1], E=np.eye(4))
+        return DepthFrame(self.folder.name, camera=camera, measurable=_measurable(self.folder), **loaded)
+
 
 def write_smoothed(
     frames: Sequence[FinishedFrame], rgb: Callable[[int], np.ndarray], holes: Thresholds | None = None
-) -> list[int]:
-    """Write the temporally smoothed depth of a video's finished frames; return the scene number of each.
+) -> Iterator[tuple[int, DepthFrame]]:
+    """Write the temporally smoothed depth of a video's finished frames.
 
     ``rgb(i)`` is ``(H, W, 3)`` in [0, 1]. The depth before smoothing stays in ``ALONE``, so repeating the
-    call changes nothing. With ``holes``, depths that are not reliable after smoothing are removed.
+    call changes nothing. With ``holes``, depths that are not reliable after smoothing are removed. After each
+    frame is written, yields the number of its scene and its maps.
     """
     scenes = scene_poses((_alone(frame), rgb(i)) for i, frame in enumerate(frames))
     averaged = temporally_smoothed(scenes, lambda i: _alone(frames[i]))
-    for frame, smoothed in zip(frames, averaged, strict=True):
+    numbers = [number for number, poses in enumerate(scenes) for _ in poses]
+    for frame, number, smoothed in zip(frames, numbers, averaged, strict=True):
         shown = smoothed if holes is None else with_holes(smoothed, holes)
         _write_agreed(frame.folder, shown, frame.unit)
-    return [number for number, poses in enumerate(scenes) for _ in poses]
+        yield number, shown
 
 
 def save_alone(
@@ -212,9 +240,7 @@ def _alone(frame: FinishedFrame) -> DepthFrame:
         paths = [folder / f"{name}.npy" for name in ("confidence", "sigma")]
         further = [np.load(path) if path.is_file() else None for path in paths]
         save_alone(folder, np.load(folder / "depth.npy"), *further)
-    maps = _loaded(folder, ALONE)
-    camera = PosedCamera(frame.K, maps["depth"].shape[::-1], E=np.eye(4))
-    return DepthFrame(folder.name, camera=camera, **maps)
+    return frame.read(ALONE)
 
 
 def write_results(
@@ -246,8 +272,9 @@ def write_results(
         write_splats(
             out / "nerfstudio", capture, names, lambda name: _splat_frame(load(name)), cloud, original
         )
-    _sheet(capture, out, names, doubted)
-    _video(capture, out, names)
+    ends = _common_range(out, names)
+    _sheet(capture, out, names, doubted, ends)
+    _video(capture, out, names, ends)
     return {"cloud_points": len(cloud.points_m)}
 
 
@@ -286,30 +313,45 @@ def _splat_frame(frame: DepthFrame) -> SplatFrame:
     return SplatFrame(frame, kept(frame))
 
 
-def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[str]) -> None:
-    """Draw evenly sampled frames and their depth with a common colour range; mark untrusted frames."""
+def _common_range(out: Path, names: Sequence[str]) -> tuple[float, float]:
+    """Return the depths at the ends of the colours of all frames, by their measured depths."""
+    depths, measured_depths = [], []
+    for name in names:
+        depth, confidence = (
+            np.load(out / name / f"{file}.npy", mmap_mode="r")[::RANGE_EVERY, ::RANGE_EVERY]
+            for file in ("depth", "confidence")
+        )
+        depths.append(depth.reshape(1, -1))
+        measured_depths.append(measured(depths[-1], confidence.reshape(1, -1) > 0, _measurable(out / name)))
+    return plotting.measured_range(np.hstack(measured_depths), np.hstack(depths))
+
+
+def _sheet(
+    capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[str], ends: tuple[float, float]
+) -> None:
+    """Draw evenly sampled frames and their depth; mark untrusted frames.
+
+    ``ends`` are the nearest and farthest depth of the colours.
+    """
     shown = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, ON_SHEET).astype(int))]
-    depths = [np.load(out / name / "depth.npy") for name in shown]
-    unit = capture.unit
-    alike = len({depth.shape for depth in depths}) == 1
-    figure = partial(plotting.depth_figure, unit=unit)
-    figures = plotting.depth_frames(depths, unit=unit) if alike else map(figure, depths)
     cells: list[Any] = []
-    for name, drawn in zip(shown, figures, strict=True):
+    for name in shown:
+        drawn = plotting.depth_figure(np.load(out / name / "depth.npy"), *ends, unit=capture.unit)
         cells += [capture.image(name), drawn]
     titles = [t for name in shown for t in (name, "depth, not trusted" if name in doubted else "depth")]
     with atomic_path(out / "sheet.jpg") as temporary:
         plotting.grid(cells, titles, columns=min(4, len(cells)), cell_width=360).save(temporary, quality=88)
 
 
-def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
-    """Write a video of every frame next to its depth and a colour bar, all of one range and size (padded)."""
-    maps = [np.load(out / name / "depth.npy", mmap_mode="r") for name in names]
-    near, far = plotting.depth_range(np.concatenate([depth[::8, ::8].reshape(-1) for depth in maps])[None])
+def _video(capture: Capture, out: Path, names: Sequence[str], ends: tuple[float, float]) -> None:
+    """Write a video of every frame next to its depth and a colour bar, all of one size (padded).
+
+    ``ends`` are the nearest and farthest depth of the colours.
+    """
 
     def frames() -> Iterator[Image.Image]:
-        for name, depth in zip(names, maps, strict=True):
-            drawn = plotting.depth_figure(depth, near, far, unit=capture.unit)
+        for name in names:
+            drawn = plotting.depth_figure(np.load(out / name / "depth.npy"), *ends, unit=capture.unit)
             photo = plotting.as_rgb_image(capture.image(name))
             photo = photo.resize((round(photo.width * drawn.height / photo.height), drawn.height))
             yield ImageOps.pad(Image.fromarray(np.hstack([np.asarray(photo), np.asarray(drawn)])), VIDEO_SIZE)

@@ -28,6 +28,7 @@ from geodiff_plugin.formats import (
     atomic_path,
     is_reoriented,
     save_png,
+    write_depth_npy,
     write_text,
     write_vertices,
 )
@@ -142,8 +143,7 @@ def _write_mask(folder: Path, kind: str, name: str, values: np.ndarray) -> str:
     """Write ``(H, W)`` uint8, and return its path in the folder."""
     path = folder / kind / f"{name}.png"
     path.parent.mkdir(exist_ok=True)
-    with atomic_path(path) as temporary:
-        save_png(Image.fromarray(values), temporary)
+    save_png(Image.fromarray(values), path)
     return path.relative_to(folder).as_posix()
 
 
@@ -156,8 +156,7 @@ def _write_image(folder: Path, capture: Capture, frame: CaptureFrame) -> str:
             shutil.copyfile(frame.image, temporary)
         return path
     path = f"images/{frame.name}.png"
-    with atomic_path(folder / path) as temporary:
-        save_png(plotting.as_rgb_image(capture.image(frame.name)), temporary)
+    save_png(plotting.as_rgb_image(capture.image(frame.name)), folder / path)
     return path
 
 
@@ -166,10 +165,8 @@ def _write_units(folder: Path, name: str, units: np.ndarray) -> str:
     known = units[units > 0]
     whole = not known.size or (known.max() <= MAX_16_BITS and np.median(known) >= MIN_UNITS)
     path = f"depths/{name}{'.png' if whole else '.npy'}"
-    with atomic_path(folder / path) as temporary:
-        if whole:
-            save_png(Image.fromarray(np.rint(units).astype(np.uint16)), temporary)
-        else:
-            with open(temporary, "wb") as file:
-                np.save(file, units.astype(np.float32), allow_pickle=False)
+    if whole:
+        save_png(Image.fromarray(np.rint(units).astype(np.uint16)), folder / path)
+    else:
+        write_depth_npy(folder / path, units)
     return path

@@ -105,6 +105,7 @@ if TYPE_CHECKING:  # public names; imported on first use at run time, because so
     from geodiff_plugin.formats.out import lock_file as lock_file
     from geodiff_plugin.formats.out import locked_folder as locked_folder
     from geodiff_plugin.formats.out import raise_unwritable as raise_unwritable
+    from geodiff_plugin.formats.out import read_report as read_report
     from geodiff_plugin.formats.out import reason_of as reason_of
     from geodiff_plugin.formats.out import write_text as write_text
     from geodiff_plugin.formats.points import read_points as read_points

@@ -60,8 +60,7 @@ def depth_mm(depth_m: np.ndarray) -> np.ndarray:
 def write_depth_mm(path: PathLike, depth_m: np.ndarray) -> int:
     """Write ``depth_mm`` as a 16-bit PNG; return its number of zero pixels."""
     whole = depth_mm(depth_m)
-    with atomic_path(path) as temporary:
-        save_png(Image.fromarray(whole), temporary)
+    save_png(Image.fromarray(whole), path)
     return int((whole == 0).sum())
 
 
@@ -77,8 +76,7 @@ def sigma_mm(sigma_m: np.ndarray) -> np.ndarray:
 
 def write_sigma_mm(path: PathLike, sigma_m: np.ndarray) -> None:
     """Write ``sigma_mm`` as a 16-bit PNG."""
-    with atomic_path(path) as temporary:
-        save_png(Image.fromarray(sigma_mm(sigma_m)), temporary)
+    save_png(Image.fromarray(sigma_mm(sigma_m)), path)
 
 
 def read_depth_png(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NoReturn, Self, TypeVar
+from typing import IO, Any, NoReturn, Self, TypeVar
 
 from geodiff_plugin._internal.checks import InputFileError, MissingFileError, bad_value
 from geodiff_plugin._internal.signals import defer_signals
@@ -189,12 +189,21 @@ def _held(hidden: Path) -> bool:
     return False
 
 
+def read_report(folder: Path) -> dict[str, Any]:
+    """Read the report of a result; empty if it is missing or unreadable."""
+    try:
+        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return report if isinstance(report, dict) else {}
+
+
 def files_of_report(folder: Path) -> set[str]:
     """Return the names of files that an earlier run wrote there, as listed in its report."""
     try:
-        names = json.loads((folder / REPORT).read_text(encoding="utf-8"))["files"]["names"]
+        names = read_report(folder)["files"]["names"]
         return {name for name in names if Path(name).name == name} if isinstance(names, list) else set()
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # missing, or not a report
+    except (KeyError, TypeError):  # no report, or of another program
         return set()
 
 

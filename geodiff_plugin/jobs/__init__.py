@@ -75,7 +75,6 @@ if TYPE_CHECKING:  # public names; imported on first use at run time, because so
     from geodiff_plugin.jobs.records import PairInputs as PairInputs
     from geodiff_plugin.jobs.records import PairResult as PairResult
     from geodiff_plugin.jobs.records import PairRun as PairRun
-    from geodiff_plugin.jobs.report import beyond_limit as beyond_limit
     from geodiff_plugin.jobs.report import depth_range_words as depth_range_words
     from geodiff_plugin.jobs.report import limit_words as limit_words
     from geodiff_plugin.jobs.report import measurable_limit as measurable_limit

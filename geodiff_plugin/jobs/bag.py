@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._internal.checks import bad_value
-from geodiff_plugin.formats import check_new_file, frame_of_target, recordings, write_text
+from geodiff_plugin.formats import check_new_file, frame_of_target, read_report, recordings, write_text
 from geodiff_plugin.jobs.camera_sources import given_camera_options
 from geodiff_plugin.jobs.finished import Row
 from geodiff_plugin.jobs.many import depth_pairs
 from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import start_many
-from geodiff_plugin.jobs.report import known_sigma, read_report, valid_depth
-from geodiff_plugin.jobs.writing import REPROJECTED_FILES
+from geodiff_plugin.jobs.report import known_sigma, valid_depth
+from geodiff_plugin.jobs.writing import DEPTH_REPROJECTED, SIGMA_REPROJECTED
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,13 @@ def depth_bag(options: DepthOptions, *, notify: Notify = silent, progress: bool 
         for ref, (stamp, _) in zip(refs, pairs, strict=True):
             if report := read_report(frames / ref.name):
                 folder = frames / ref.name
-                K = report["K"] if camera is None else camera.K
-                depth_m = valid_depth(folder) if camera is None else np.load(folder / REPROJECTED_FILES[0])
-                sigma_m = None if camera is not None else known_sigma(folder)
-                yield recordings.BagFrame(stamp, depth_m, np.reshape(K, (3, 3)), sigma_m)
+                if camera is None:
+                    K, depth_m = np.reshape(report["K"], (3, 3)), valid_depth(folder)
+                    sigma_m = known_sigma(folder)
+                else:
+                    K, depth_m = camera.K, np.load(folder / DEPTH_REPROJECTED[0])
+                    sigma_m = known_sigma(folder, SIGMA_REPROJECTED[0])
+                yield recordings.BagFrame(stamp, depth_m, K, sigma_m)
 
     frame_id = frame_id if options.reproject is None else frame_of_target(options.reproject)
     count = recordings.write_depth_bag(out, results(), frame_id, options.encoding)

@@ -13,14 +13,22 @@ import torch
 
 from geodiff_plugin import __version__
 from geodiff_plugin.capture.frames import Capture
-from geodiff_plugin.capture.results import ALONE, read_agreed, save_alone
+from geodiff_plugin.capture.results import ALONE, FinishedFrame, save_alone
 from geodiff_plugin.findings import as_records
-from geodiff_plugin.formats import MAP_SUFFIXES, REPORT, OutFolder, find_map, read_map, write_text
+from geodiff_plugin.formats import (
+    MAP_SUFFIXES,
+    REPORT,
+    OutFolder,
+    find_map,
+    read_map,
+    read_report,
+    write_text,
+)
 from geodiff_plugin.jobs.journal import Item, Record
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.jobs.prior import prior_of_capture
-from geodiff_plugin.jobs.report import plain, read_report, single_map, verdict_report
+from geodiff_plugin.jobs.report import measurable_limit, plain, single_map, verdict_report
 from geodiff_plugin.jobs.writing import thresholds, write_maps, write_previews
 from geodiff_plugin.result.output import MetricDepthOutput
 
@@ -111,6 +119,7 @@ def _report(capture: Capture, options: CaptureOptions, item: Item, output: Metri
         "connected": bool(solved.connected[number]),
         "scale_rel_std": plain(round(solved.scale_rel_std, 4)),
         "depth": _percentiles(single_map(output.prediction)),
+        "measurable_m": plain(measurable_limit(output)),
         "poses": [pose.status for pose in output.poses],
         "verdict": verdict_report(output),
         "findings": as_records(output.findings),
@@ -129,10 +138,11 @@ def write_agreed_frame(capture: Capture, name: str, folder: Path) -> Record:
 
     Returns the entries of the report that changed.
     """
-    depth, confidence, sigma = read_agreed(folder)
     report = read_report(folder)
-    points = write_previews(folder, capture.image(name), depth, confidence, sigma, report)
-    changed = {"depth": _percentiles(depth), "files": report["files"] | {"cloud_points": points}}
+    frame = FinishedFrame.of(folder, report)
+    maps = frame.read()
+    counts = write_previews(frame, maps, capture.image(name))
+    changed = {"depth": _percentiles(maps.depth), "files": report["files"] | counts}
     write_text(folder / REPORT, json.dumps(report | changed, indent=2) + "\n")
     return changed
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from geodiff_plugin._internal.checks import bad_value
+from geodiff_plugin.formats import read_report
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import file_digests
-from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.settings import Affects, settings_of
 
 Row = dict[str, Any]
@@ -89,10 +89,14 @@ def _changed_inputs(options: DepthOptions, report: dict[str, Any]) -> list[str]:
     return [path for path, digest in file_digests(options).items() if digests.get(path, digest) != digest]
 
 
-def _confidence(verdict: dict[str, Any]) -> float | None:
-    """Return the mean confidence of a verdict in a report."""
-    found: dict[str, float | None] = verdict["facts"].get("matched_fraction", {})
-    return found.get("confidence")
+def _confidence(report: dict[str, Any]) -> float | None:
+    """Return the mean confidence of a report; ``None`` if it is unknown or the depth is not trusted."""
+    verdict = report["verdict"]
+    alone: float | None = verdict["facts"].get("matched_fraction", {}).get("confidence")
+    if verdict["status"] != "trusted" or alone is None:
+        return None
+    smoothed: float | None = report.get("temporal_smoothing", {}).get("confidence_mean")
+    return alone if smoothed is None else smoothed
 
 
 def _texts(report: dict[str, Any], *severities: str) -> list[str]:
@@ -100,15 +104,23 @@ def _texts(report: dict[str, Any], *severities: str) -> list[str]:
     return [each["text"] for each in report.get("findings", ()) if each["severity"] in severities]
 
 
-def row_of(report: dict[str, Any]) -> Row:
-    """Return the table row of a report, including why the pair is not trusted."""
-    depth, verdict = report["depth"], report["verdict"]
+def depth_columns(report: dict[str, Any]) -> Row:
+    """Return the columns of a table row that describe the depth: nearest, median, farthest, confidence."""
+    depth = report["depth"]
     return {
         "near_m": depth["min_m"],
         "median_m": depth["median_m"],
         "far_m": depth["max_m"],
+        "confidence": _confidence(report),
+    }
+
+
+def row_of(report: dict[str, Any]) -> Row:
+    """Return the table row of a report, including why the pair is not trusted."""
+    verdict = report["verdict"]
+    return {
+        **depth_columns(report),
         "verdict": verdict["status"],
-        "confidence": _confidence(verdict) if verdict["status"] == "trusted" else None,
         "seconds": round(sum(report["seconds"].values()), 3),
         "message": " ".join(_texts(report, "warning", "remark")) or None,
         "reasons": " ".join(verdict["reasons"]),

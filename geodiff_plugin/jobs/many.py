@@ -16,7 +16,7 @@ from geodiff_plugin._internal.threads import WithinCores, available_cores, leave
 from geodiff_plugin.findings import Severity
 from geodiff_plugin.formats import OutFolder, has_pose_per_image
 from geodiff_plugin.jobs.failures import RESUMES, full_disk
-from geodiff_plugin.jobs.finished import Row, finished_row
+from geodiff_plugin.jobs.finished import Row, depth_columns, finished_row
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard
 from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import DepthOptions, start_pair
@@ -241,7 +241,8 @@ def depth_pairs(
         rows = [_final(record, finished.get(record["key"]), options, notify) for record in records]
         write_table(shard.path(options.out / SUMMARY), rows, notify)
         if options.temporal_smoothing:
-            _average_frames(options, items, rows, notify)
+            rows = _with_smoothed_depth(options, items, rows, notify)
+            write_table(options.out / SUMMARY, rows, notify)
     return rows
 
 
@@ -249,14 +250,16 @@ def _item(ref: PairRef, out: Path) -> Item:
     return Item(ref.name, ref, words=(str(ref.left), str(ref.right), str(out / ref.name)))
 
 
-def _average_frames(
+def _with_smoothed_depth(
     options: DepthOptions, items: Sequence[Item], rows: Sequence[Row], notify: Notify
-) -> None:
-    """Apply ``--temporal-smoothing`` to the frames that did not fail."""
+) -> list[Row]:
+    """Apply ``--temporal-smoothing`` to the frames that did not fail; return the rows with the new depth."""
     failed = {row["pair"] for row in rows if row["result"] == "failed"}
     with PairReader(options) as reader:
         refs = [item.payload for item in items if item.key not in failed]
-        write_smoothed_frames(options, refs, reader.frames_of, notify)
+        reports = write_smoothed_frames(options, refs, reader.frames_of, notify)
+    smoothed = {ref.name: depth_columns(report) for ref, report in zip(refs, reports, strict=True)}
+    return [row | smoothed.get(row["pair"], {}) for row in rows]
 
 
 def _device_of(options: DepthOptions, shard: Shard) -> torch.device:

@@ -319,8 +319,8 @@ class DepthOptions(MachineOptions, SpeedOptions, RigOptions):
     )
     reproject: Path | None = _output(
         None,
-        "Also reproject the depth into another camera, described by a JSON file with its K, its pose E in "
-        "the left camera's frame, width and height, or into a RealSense's colour camera, described by the "
+        "Also reproject depth and sigma into another camera, described by a JSON file with its K, its pose E "
+        "in the left camera's frame, width and height, or into a RealSense's colour camera, described by the "
         "output of rs-enumerate-devices -c.",
         affects=RESULT,
     )

@@ -13,11 +13,10 @@ from geodiff_plugin._internal.checks import bad_value
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import clear_frame
 from geodiff_plugin.findings import some_names
-from geodiff_plugin.formats import REPORT, CaptureFrame, find_map, write_text
+from geodiff_plugin.formats import REPORT, CaptureFrame, find_map, read_report, write_text
 from geodiff_plugin.jobs.finished import input_change, option_changes
 from geodiff_plugin.jobs.journal import Record, fingerprint
 from geodiff_plugin.jobs.options import CaptureOptions
-from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.settings import Affects, names_affecting, settings_of
 
 #: Name of the file with the record.

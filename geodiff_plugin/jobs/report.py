@@ -13,9 +13,9 @@ import torch
 
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.findings import Severity, as_records
-from geodiff_plugin.formats import REPORT
 from geodiff_plugin.jobs.records import PairRun
 from geodiff_plugin.result.output import MetricDepthOutput
+from geodiff_plugin.result.readings import beyond_limit, measured
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.trust import (
     UNTESTED,
@@ -23,15 +23,7 @@ from geodiff_plugin.trust import (
     MatchedFraction,
     summary_words,
 )
-
-
-def read_report(folder: Path) -> dict[str, Any]:
-    """Read the report of a result; empty if it is missing or unreadable."""
-    try:
-        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return report if isinstance(report, dict) else {}
+from geodiff_plugin.types import DepthFrame
 
 
 def valid_depth(folder: Path) -> np.ndarray:
@@ -41,9 +33,9 @@ def valid_depth(folder: Path) -> np.ndarray:
     return depth_m * (np.load(confidence, allow_pickle=False) > 0) if confidence.is_file() else depth_m
 
 
-def known_sigma(folder: Path) -> np.ndarray | None:
+def known_sigma(folder: Path, name: str = "sigma.npy") -> np.ndarray | None:
     """Read the standard deviation of a result's depth, ``(H, W)`` metres; ``None`` if it has none."""
-    path = folder / "sigma.npy"
+    path = folder / name
     return np.load(path, allow_pickle=False) if path.is_file() else None
 
 
@@ -69,16 +61,9 @@ def measurable_limit(output: MetricDepthOutput) -> float | None:
     return None if output.measurable_m is None else float(output.measurable_m[0])
 
 
-def beyond_limit(depth_m: np.ndarray, measurable_m: float | None) -> np.ndarray:
-    """Return the mask ``(H, W)`` of depths that are too far to be measured, as in the sky."""
-    return np.isfinite(depth_m) & (depth_m > (math.inf if measurable_m is None else measurable_m))
-
-
 def measured_depth(output: MetricDepthOutput) -> np.ndarray:
     """Return the depth of an output with one image, ``(H, W)``; 0 where it is invalid or too far."""
-    depth_m = single_map(output.prediction)
-    measured = single_map(output.valid) & ~beyond_limit(depth_m, measurable_limit(output))
-    return np.where(measured, depth_m, 0.0)
+    return measured(single_map(output.prediction), single_map(output.valid), measurable_limit(output))
 
 
 def depth_summary(
@@ -96,14 +81,12 @@ def depth_summary(
     has_depth = np.isfinite(depth_m) & (depth_m > 0)
     valid = has_depth if valid is None else has_depth & valid
     beyond = beyond_limit(depth_m, measurable_m)
-    kept, measured = (
-        depth_m[mask] if mask.any() else np.array([math.nan]) for mask in (valid, valid & ~beyond)
-    )
+    kept, near = (depth_m[mask] if mask.any() else np.array([math.nan]) for mask in (valid, valid & ~beyond))
     return {
         "min_m": float(kept.min()),
         "median_m": float(np.median(kept)),
         "mean_m": float(kept.mean()),
-        "max_m": float(measured.max()),
+        "max_m": float(near.max()),
         "beyond_m": measurable_m if beyond.any() else None,
         "beyond_fraction": float(beyond.mean()),
         "width": depth_m.shape[1],
@@ -111,6 +94,32 @@ def depth_summary(
         "invalid_pixels": int((~valid).sum()),
         "visible_fraction": 0.0 if visible is None else float(visible.mean()),
     }
+
+
+def smoothed_entries(report: dict[str, Any], frame: DepthFrame) -> dict[str, Any]:
+    """Return the entries of a frame's report that describe its maps after temporal smoothing.
+
+    ``temporal_smoothing.alone`` keeps the entries of the frame's own result, also if smoothing is repeated.
+    """
+    names = ("depth", "sigma_median_m")
+    alone = report.get("temporal_smoothing", {}).get("alone") or {name: report[name] for name in names}
+    known = frame.depth > 0
+    depth = depth_summary(frame.depth, None, frame.confidence > 0, frame.measurable)
+    entries = {
+        "depth": depth | {"visible_fraction": alone["depth"]["visible_fraction"]},
+        "sigma_median_m": median_sigma(frame.sigma),
+        "temporal_smoothing": {
+            "confidence_mean": float(frame.confidence[known].mean()) if known.any() else 0.0,
+            "alone": alone,
+        },
+    }
+    return plain(entries)
+
+
+def median_sigma(sigma_m: np.ndarray | None) -> float | None:
+    """Return the median of the known standard deviations ``(H, W)``; ``None`` if there are none."""
+    known = np.zeros(0) if sigma_m is None else sigma_m[np.isfinite(sigma_m)]
+    return float(np.median(known)) if known.size else None
 
 
 def plain(value: Any) -> Any:
@@ -167,13 +176,12 @@ def build_report(run: PairRun) -> dict[str, Any]:
         error = float(single_map(output.photometric_error)[visible].mean()) if visible.any() else math.nan
     spread = output.uncertainty
     names = ("K", "scale", "shift", "global_scale", "prior_scale", "prior_error", "unit")
-    sigma = None if output.sigma is None else single_map(output.sigma)
-    known = None if sigma is None else sigma[np.isfinite(sigma)]
     report = {
         "depth": output_summary(output),
+        "measurable_m": measurable_limit(output),
         "verdict": verdict_report(output),
         "photometric_error_mean": error,
-        "sigma_median_m": None if known is None or not known.size else np.median(known),
+        "sigma_median_m": median_sigma(None if output.sigma is None else single_map(output.sigma)),
         "uncertainty_median_m": None if spread is None else np.median(single_map(spread)),
         **{name: getattr(output, name) for name in names},
         "history": [vars(step) for step in output.history],

@@ -12,8 +12,14 @@ import numpy as np
 
 from geodiff_plugin import formats, plotting
 from geodiff_plugin._internal.checks import bad_value, raise_input_error
-from geodiff_plugin.formats import REPORT, check_new_file, disparity_of_depth, read_npy, write_text
-from geodiff_plugin.jobs.report import read_report
+from geodiff_plugin.formats import (
+    REPORT,
+    check_new_file,
+    disparity_of_depth,
+    read_npy,
+    read_report,
+    write_text,
+)
 
 #: File layout of the submission to each benchmark.
 BENCHMARKS = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -12,15 +11,24 @@ from typing import Any
 import numpy as np
 
 from geodiff_plugin._internal.checks import InputError
-from geodiff_plugin.capture.results import AGREED, ALONE, FinishedFrame, write_smoothed
+from geodiff_plugin.cameras import Camera
+from geodiff_plugin.capture.results import AGREED, ALONE, FIGURES, FinishedFrame, write_smoothed
 from geodiff_plugin.findings import some_names
-from geodiff_plugin.formats import REPORT, reason_of, write_text
+from geodiff_plugin.formats import REPORT, read_report, reason_of, write_text
 from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef, options_of
 from geodiff_plugin.jobs.reading import read_pair
-from geodiff_plugin.jobs.report import read_report, valid_depth
-from geodiff_plugin.jobs.writing import thresholds, write_reprojected
+from geodiff_plugin.jobs.report import report_text, smoothed_entries
+from geodiff_plugin.jobs.writing import (
+    DEPTH_REPROJECTED,
+    PREVIEWS,
+    SIGMA_REPROJECTED,
+    thresholds,
+    write_previews,
+    write_reprojected,
+)
+from geodiff_plugin.types import DepthFrame
 
 
 @dataclass
@@ -33,13 +41,14 @@ class _Result:
     @property
     def frame(self) -> FinishedFrame:
         """Return folder, K and unit of its maps."""
-        return FinishedFrame(self.folder, np.reshape(self.report["K"], (3, 3)), self.report["unit"])
+        return FinishedFrame.of(self.folder, self.report)
 
     def add(self, names: Iterable[str], **entries: Any) -> None:
-        """Add maps to the files listed in the report, so that a later run with --overwrite replaces them."""
+        """Add entries to the report, and files to its list, so that a run with --overwrite replaces them."""
         files = self.report["files"]
-        files["names"] = sorted({*files["names"], *(f"{name}.npy" for name in names)})
-        write_text(self.folder / REPORT, json.dumps(self.report | entries, indent=2) + "\n")
+        files["names"] = sorted({*files["names"], *names})
+        self.report |= entries
+        write_text(self.folder / REPORT, report_text(self.report) + "\n")
 
 
 def write_smoothed_frames(
@@ -47,14 +56,19 @@ def write_smoothed_frames(
     refs: Sequence[PairRef],
     frames_of: Callable[[PairRef], Sequence[np.ndarray] | None],
     notify: Notify = silent,
-) -> None:
-    """Average the depth of each finished frame with its neighbours' where they agree, and update its report.
+) -> list[dict[str, Any]]:
+    """Average the depth of each finished frame with its neighbours' where they agree.
+
+    Its maps and the files drawn from them are written again, its report last.
 
     Args:
         options: options of the run, with ``out``.
         refs: the frames, each with a result.
         frames_of: returns left and right view of a pair of frames, ``None`` for a pair of files.
         notify: receives a line with the frames at which scenes start.
+
+    Returns:
+        The reports of the frames.
 
     Raises:
         InputError: unreadable or unwritable files.
@@ -63,22 +77,22 @@ def write_smoothed_frames(
     folders = [options.out / ref.name for ref in refs]
     results = [_Result(folder, read_report(folder)) for folder in folders]
 
-    def image(i: int) -> np.ndarray:
-        results[i].add(ALONE)
+    def left(i: int) -> np.ndarray:
         return read_pair(options_of(refs[i], options), frames_of(refs[i]), packing=refs[i].packing).left
 
+    def image(i: int) -> np.ndarray:
+        results[i].add(_npy(ALONE))
+        return left(i)
+
+    scenes = list[int]()
     try:
         with warnings.catch_warnings(action="ignore"):  # the run of the pair has issued them
             # Smoothing may replace a depth by one with a larger sigma, so the thresholds apply again.
             holes = thresholds(options) if options.holes else None
-            scenes = write_smoothed([result.frame for result in results], image, holes)
-        for result, scene in zip(results, scenes, strict=True):
-            if options.reproject is not None:
-                depth = valid_depth(result.folder)
-                result.report["reproject"] = write_reprojected(
-                    result.folder, depth, result.frame.K, options.target_camera()
-                )
-            result.add(AGREED, temporal_smoothing={"scene": scene})
+            smoothed = write_smoothed([result.frame for result in results], image, holes)
+            for i, (scene, maps) in enumerate(smoothed):
+                _update(results[i], scene, maps, left(i), options)
+                scenes.append(scene)
     except OSError as error:
         raise InputError(
             f"--temporal-smoothing failed ({reason_of(error)}). Run the same command again to resume."
@@ -88,3 +102,24 @@ def write_smoothed_frames(
         notify(
             f"--temporal-smoothing: scenes start at {some_names(begins)}; depth is not averaged across them."
         )
+    return [result.report for result in results]
+
+
+def _npy(maps: Iterable[str]) -> list[str]:
+    """Return the files of maps."""
+    return [f"{name}.npy" for name in maps]
+
+
+def _update(result: _Result, scene: int, maps: DepthFrame, left: np.ndarray, options: DepthOptions) -> None:
+    """Write the files of a frame that depend on its smoothed maps, then its report."""
+    frame, report = result.frame, result.report
+    written = [*_npy(AGREED), *FIGURES, *PREVIEWS]
+    entries = smoothed_entries(report, maps)
+    report["files"] |= write_previews(frame, maps, left, thresholds(options))
+    if options.reproject is not None:
+        depth_m, target = maps.depth * (maps.confidence > 0), options.target_camera()
+        entries["reproject"] = write_reprojected(result.folder, depth_m, maps.sigma, Camera(frame.K), target)
+        written += DEPTH_REPROJECTED + SIGMA_REPROJECTED
+    unchanged = sorted({*report["files"]["names"]} - {*written, *_npy(ALONE), REPORT})
+    entries["temporal_smoothing"] |= {"scene": scene, "unchanged_files": unchanged}
+    result.add(written, **entries)

@@ -9,9 +9,9 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin import formats, plotting
-from geodiff_plugin._internal.reprojection import depth_in_camera
+from geodiff_plugin._internal.reprojection import maps_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
-from geodiff_plugin.capture.results import Thresholds
+from geodiff_plugin.capture.results import EVERY_DEPTH, FinishedFrame, Thresholds, reliable
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import REPORT, HeldFolder, OutFolder, in_8_bits, save_png
 from geodiff_plugin.jobs.finished import Row, row_of
@@ -20,9 +20,13 @@ from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, LiveOption
 from geodiff_plugin.jobs.records import PairInputs, PairResult, PairRun
 from geodiff_plugin.jobs.report import build_report, measured_depth, report_text, single_map, used_poses
 from geodiff_plugin.result.output import MetricDepthOutput
+from geodiff_plugin.types import DepthFrame
 
-#: Files with the depth in the camera of ``--reproject``, in metres (float) and whole millimetres.
-REPROJECTED_FILES = ("depth_reprojected.npy", "depth_reprojected_mm.png")
+#: Files that ``write_previews`` writes.
+PREVIEWS = ("cloud.ply", "confidence.png", "overview.png")
+#: Files with depth and sigma in the camera of ``--reproject``, each in metres (float) and whole millimetres.
+DEPTH_REPROJECTED = ("depth_reprojected.npy", "depth_reprojected_mm.png")
+SIGMA_REPROJECTED = ("sigma_reprojected.npy", "sigma_reprojected_mm.png")
 
 
 def write_pair(folder: OutFolder | HeldFolder, run: PairRun, max_points: int | None = None) -> PairResult:
@@ -44,8 +48,11 @@ def write_pair(folder: OutFolder | HeldFolder, run: PairRun, max_points: int | N
                 write_undistorted(place, inputs.left)
             if options.reproject is not None:
                 depth_m = single_map(output.prediction * output.valid)
-                K = np.asarray(output.K)[0].astype(np.float64)
-                report["reproject"] = write_reprojected(place, depth_m, K, options.target_camera())
+                sigma_m = None if output.sigma is None else single_map(output.sigma)
+                camera = Camera(np.asarray(output.K)[0].astype(np.float64))
+                report["reproject"] = write_reprojected(
+                    place, depth_m, sigma_m, camera, options.target_camera()
+                )
             if options.export:
                 write_exports(place, output, inputs, options, max_points)
         report["files"]["names"] = [*sorted(path.name for path in place.iterdir()), REPORT]
@@ -94,16 +101,30 @@ def write_maps(
         np.save(folder / f"{name}.npy", values.astype(np.float32))
     left = in_8_bits(left)
     _write_figures(folder, output, left, depth_m, maps)
+    pixels = ShownPixels(depth_m, left, K, valid)
+    kept = single_map(output.reliable(min_confidence, max_sigma))
+    counts = _write_cloud(folder, pixels, kept, sigma_m, output.unit, max_points)
+    return {"depth_mm_zero_pixels": zeros} | counts
+
+
+def _write_cloud(
+    folder: Path,
+    pixels: ShownPixels,
+    reliable_px: np.ndarray,
+    sigma_m: np.ndarray | None,
+    unit: str | None,
+    max_points: int | None = None,
+) -> dict[str, int]:
+    """Write ``cloud.ply`` with the reliable pixels ``(H, W)`` except flying points; return report counts."""
+    depth_m, left, K, valid = pixels
     flying = formats.flying_points(depth_m)
-    reliable = single_map(output.reliable(min_confidence, max_sigma))
-    kept = _thinned(reliable & ~flying, max_points)
+    kept = _thinned(reliable_px & ~flying, max_points)
     cloud = folder / "cloud.ply"
-    points = formats.write_ply(cloud, depth_m, left, K, valid=kept, unit=output.unit, sigma_m=sigma_m)
+    points = formats.write_ply(cloud, depth_m, left, K, valid=kept, unit=unit, sigma_m=sigma_m)
     return {
-        "depth_mm_zero_pixels": zeros,
         "cloud_points": points,
         "flying_points": int(flying.sum()),
-        "doubtful_points": int((valid & ~reliable).sum()),
+        "doubtful_points": int((valid & ~reliable_px).sum()),
         "points_out_of_reach": int((~valid).sum()),
     }
 
@@ -130,35 +151,34 @@ def _write_figures(
 
 
 def write_previews(
-    folder: Path,
-    left: np.ndarray,
-    depth: np.ndarray,
-    confidence: np.ndarray,
-    sigma: np.ndarray,
-    report: dict[str, Any],
-) -> int:
-    """Write cloud, ``confidence.png`` and ``overview.png`` of changed maps ``(H, W)``; return cloud points.
+    frame: FinishedFrame, maps: DepthFrame, left: np.ndarray, limits: Thresholds = EVERY_DEPTH
+) -> dict[str, int]:
+    """Write cloud, ``confidence.png`` and ``overview.png`` of a frame again after its maps have changed.
 
-    ``report`` is the one of the folder.
+    Its ``depth.png`` has been drawn again. The cloud has the points that are reliable under the ``limits``.
+    Returns the counts of ``write_maps``.
     """
-    left = in_8_bits(left)
-    figure = _save_figure(plotting.fraction_figure(confidence, "confidence", 1.0), folder / "confidence.png")
+    folder, left = frame.folder, in_8_bits(left)
+    assert maps.sigma is not None  # saved with every frame
+    confidence = plotting.fraction_figure(maps.confidence, "confidence", 1.0)
+    confidence = _save_figure(confidence, folder / "confidence.png")
     error = None
     if (folder / "visible.png").is_file():
         visible = np.asarray(Image.open(folder / "visible.png")) > 0
         error = np.where(visible, np.load(folder / "photometric_error.npy"), np.nan)
-    shown = plotting.shrunk(plotting.depth_figure(depth, unit=report["unit"]))
-    save_png(plotting.overview(left, shown, figure, error), folder / "overview.png")
-    valid = (depth > 0) & ~formats.flying_points(depth)
-    K = np.reshape(report["K"], (3, 3))
-    cloud = folder / "cloud.ply"
-    return formats.write_ply(cloud, depth, left, K, valid=valid, unit=report["unit"], sigma_m=sigma)
+    with Image.open(folder / "depth.png") as figure:
+        depth = plotting.shrunk(figure)
+    save_png(plotting.overview(left, depth, confidence, error), folder / "overview.png")
+    valid = (maps.depth > 0) & (maps.confidence > 0)
+    zeros = int((formats.depth_mm(maps.depth * valid) == 0).sum())
+    pixels = ShownPixels(maps.depth, left, frame.K, valid)
+    kept = valid & reliable(maps, limits)
+    return {"depth_mm_zero_pixels": zeros} | _write_cloud(folder, pixels, kept, maps.sigma, frame.unit)
 
 
 def figure_range(output: MetricDepthOutput) -> tuple[float, float]:
     """Return the depths at the ends of a figure's colours; depths that were not measured do not count."""
-    measured_m = measured_depth(output)
-    return plotting.depth_range(measured_m if (measured_m > 0).any() else single_map(output.prediction))
+    return plotting.measured_range(measured_depth(output), single_map(output.prediction))
 
 
 def _thinned(kept: np.ndarray, max_points: int | None) -> np.ndarray:
@@ -178,17 +198,20 @@ def _save_figure(figure: Image.Image, path: Path) -> Image.Image:
 
 
 def write_reprojected(
-    folder: Path, depth_m: np.ndarray, K: np.ndarray, camera: PosedCamera
+    folder: Path, depth_m: np.ndarray, sigma_m: np.ndarray | None, camera: Camera, other: PosedCamera
 ) -> dict[str, Any]:
-    """Write a depth map ``(H, W)`` in the camera of ``--reproject``; return its report entry."""
-    seen_m = depth_in_camera(depth_m, Camera(K), camera)
-    formats.write_depth_npy(folder / REPROJECTED_FILES[0], seen_m)
-    formats.write_depth_mm(folder / REPROJECTED_FILES[1], seen_m)
+    """Write depth and sigma ``(H, W)`` as the camera of ``--reproject`` sees them; return a report entry."""
+    seen_m, sigma_seen_m = maps_in_camera(depth_m, sigma_m, camera, other)
+    formats.write_depth_npy(folder / DEPTH_REPROJECTED[0], seen_m)
+    formats.write_depth_mm(folder / DEPTH_REPROJECTED[1], seen_m)
+    if sigma_seen_m is not None:
+        formats.write_depth_npy(folder / SIGMA_REPROJECTED[0], sigma_seen_m)
+        formats.write_sigma_mm(folder / SIGMA_REPROJECTED[1], sigma_seen_m)
     known = round(float((seen_m > 0).mean()), 4)
     return {
-        "K": camera.K.tolist(),
-        "E": camera.E.tolist(),
-        "size": list(camera.size),
+        "K": other.K.tolist(),
+        "E": other.E.tolist(),
+        "size": list(other.size),
         "known_fraction": known,
     }
 

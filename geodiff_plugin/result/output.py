@@ -18,7 +18,7 @@ from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.findings import Finding, dedupe
 from geodiff_plugin.pose.estimate import NO_UNIT
 from geodiff_plugin.result.finish import ImageResult
-from geodiff_plugin.result.readings import reproject
+from geodiff_plugin.result.readings import Reprojected, reproject
 from geodiff_plugin.result.sigma import depth_sigma, geometric_sigma
 from geodiff_plugin.scale.space import cat_samples
 from geodiff_plugin.trust import Verdict
@@ -160,12 +160,12 @@ class MetricDepthOutput(BaseOutput):
         maps: dict[str, Any] = {name: x * kept for name in names if (x := getattr(self, name)) is not None}
         return replace(self, **maps)
 
-    def reproject(self, K: np.ndarray, E: np.ndarray, size: tuple[int, int]) -> np.ndarray | torch.Tensor:
-        """Reproject the depth into another camera, for example from an infrared pair into the colour camera.
+    def reproject(self, K: np.ndarray, E: np.ndarray, size: tuple[int, int]) -> Reprojected:
+        """Reproject depth and sigma into another camera, such as the colour camera of an infrared pair.
 
         Z-buffered: the nearest surface wins. The prior makes surfaces dense, so there are no holes between
         the pixels of one surface. Points that the left camera does not see, or that are not ``valid``, have
-        depth 0.
+        depth 0 and sigma NaN.
 
         Args:
             K: ``(3, 3)`` intrinsics in pixels of that camera's image, without lens distortion.
@@ -173,8 +173,11 @@ class MetricDepthOutput(BaseOutput):
             size: ``(width, height)`` of its image.
 
         Returns:
-            Depth along z of that camera, shaped like ``prediction``: ``(N, height, width, 1)`` numpy or ``(N,
-            1, height, width)`` torch, float32.
+            ``depth`` along z of that camera and its standard deviation ``sigma``, in the output's unit, both
+            shaped like ``prediction``: ``(N, height, width, 1)`` numpy or ``(N, 1, height, width)`` torch,
+            float32. ``sigma`` belongs to the nearest surface. It is multiplied by the change of that camera's
+            depth per change of depth along the left camera's ray, about 1 for nearly parallel cameras.
+            ``None`` if the output has no sigma.
 
         Raises:
             InputError: invalid K, E or size.
@@ -182,7 +185,7 @@ class MetricDepthOutput(BaseOutput):
         camera = check_posed_camera(K, E, size)
         if self.K is None:
             raise AttributeError("This output has no K: it was not made by a guided call.")
-        return reproject(self.prediction * self.valid, self.K, camera)
+        return reproject(self.prediction * self.valid, self.sigma, self.K, camera)
 
     def __repr__(self) -> str:
         """Summarize sizes, range and verdict in a few lines, without arrays."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from geodiff_plugin._internal.checks import bad_value
-from geodiff_plugin._internal.reprojection import depth_in_camera
+from geodiff_plugin._internal.reprojection import maps_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
 from geodiff_plugin.result.sigma import relative_sigma
 
@@ -75,6 +78,19 @@ def distance_m(a: Reading, b: Reading) -> tuple[float, float | None]:
     return length, float(np.hypot(of_a, of_b) / length)
 
 
+def beyond_limit(depth: np.ndarray, measurable: float | None) -> np.ndarray:
+    """Return the mask ``(H, W)`` of depths that are too far to be measured, as in the sky.
+
+    ``measurable`` is the farthest measurable depth, in the unit of ``depth``; ``None`` if unknown.
+    """
+    return np.isfinite(depth) & (depth > (math.inf if measurable is None else measurable))
+
+
+def measured(depth: np.ndarray, valid: np.ndarray, measurable: float | None) -> np.ndarray:
+    """Return a depth map ``(H, W)`` with 0 where it is not ``valid (H, W)`` or too far to be measured."""
+    return np.where(valid & ~beyond_limit(depth, measurable), depth, 0.0)
+
+
 def metres(value: float, spread: float | None = None, unit: str | None = "m") -> str:
     """Format a length as ``2.31 m`` or ``2.31 ± 0.07 m``, with 3 decimals for spreads below 5 mm.
 
@@ -85,23 +101,40 @@ def metres(value: float, spread: float | None = None, unit: str | None = "m") ->
     return f"{shown} {unit or 'units of the poses'}"
 
 
+class Reprojected(NamedTuple):
+    """Maps of another camera, ``(N, height, width, 1)`` numpy or ``(N, 1, height, width)`` torch, float32."""
+
+    depth: np.ndarray | torch.Tensor  # along z of that camera; 0 where it sees none
+    sigma: np.ndarray | torch.Tensor | None  # standard deviation of the depth; NaN where unknown
+
+
 def reproject(
-    depth: np.ndarray | torch.Tensor, K: np.ndarray | torch.Tensor, camera: PosedCamera
-) -> np.ndarray | torch.Tensor:
-    """Reproject depth maps into another camera, along its z and in the same unit; 0 where it sees none.
+    depth: np.ndarray | torch.Tensor,
+    sigma: np.ndarray | torch.Tensor | None,
+    K: np.ndarray | torch.Tensor,
+    camera: PosedCamera,
+) -> Reprojected:
+    """Reproject depth maps and their standard deviations into another camera, in the same unit.
 
     Args:
         depth: ``(N, H, W, 1)`` numpy or ``(N, 1, H, W)`` torch, 0 where there is no depth.
+        sigma: standard deviation of ``depth``, shaped like it; NaN where unknown, ``None`` if there is none.
         K: ``(N, 3, 3)`` intrinsics of the maps, pixels.
         camera: the other camera, with ``size (width, height)``.
-
-    Returns:
-        ``(N, height, width, 1)`` numpy or ``(N, 1, height, width)`` torch, float32.
     """
+
+    def on_host(maps: np.ndarray | torch.Tensor) -> np.ndarray:
+        return maps[..., 0] if isinstance(maps, np.ndarray) else maps[:, 0].numpy(force=True)
+
+    def stacked(maps: Sequence[np.ndarray]) -> np.ndarray | torch.Tensor:
+        every = np.stack(maps)
+        if isinstance(depth, np.ndarray):
+            return every[..., None]
+        return torch.from_numpy(every[:, None]).to(depth.device)
+
     Ks = K if isinstance(K, np.ndarray) else K.numpy(force=True)
-    maps = depth[..., 0] if isinstance(depth, np.ndarray) else depth[:, 0].numpy(force=True)
-    pairs = zip(maps, map(Camera, Ks.astype(np.float64)), strict=True)
-    seen = np.stack([depth_in_camera(each, left, camera) for each, left in pairs])
-    if isinstance(depth, np.ndarray):
-        return seen[..., None]
-    return torch.from_numpy(seen[:, None]).to(depth.device)
+    sigmas = [None] * len(depth) if sigma is None else on_host(sigma)
+    images = zip(on_host(depth), sigmas, map(Camera, Ks.astype(np.float64)), strict=True)
+    seen = [maps_in_camera(*image, camera) for image in images]
+    known = [each for _, each in seen if each is not None]
+    return Reprojected(stacked([each for each, _ in seen]), stacked(known) if known else None)

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin._internal.reprojection import depth_in_camera
+from geodiff_plugin._internal.reprojection import maps_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
-from tests.cli.conftest import QUICK, report_of
+from tests.cli.conftest import report_of
 from tests.unit.formats.test_target import extrinsic, intrinsic
 
 pytestmark = pytest.mark.end_to_end
 
+#: A preset with confidence and sigma.
+QUICK = ["--steps", "1", "--preset", "fast", "--device", "cpu"]
 K_TO = [[70.0, 0, 40.0], [0, 70.0, 28.0], [0, 0, 1]]
 E_TO = [[1.0, 0, 0, 0.02], [0, 1, 0, -0.01], [0, 0, 1, 0], [0, 0, 0, 1]]
 CAMERA = {"K": K_TO, "E": E_TO, "width": 80, "height": 56, "frame_id": "colour"}
@@ -26,16 +28,24 @@ def camera_file(folder, **changed):
 
 
 def expected_of(folder):
-    depth_m, K = np.load(folder / "depth.npy"), np.reshape(report_of(folder)["K"], (3, 3))
-    return depth_in_camera(depth_m, Camera(K), PosedCamera(np.array(K_TO), (80, 56), E=np.array(E_TO)))
+    """Depth and sigma."""
+    depth, confidence, sigma = (np.load(folder / f"{name}.npy") for name in ("depth", "confidence", "sigma"))
+    camera = PosedCamera(np.array(K_TO), (80, 56), E=np.array(E_TO))
+    K = np.reshape(report_of(folder)["K"], (3, 3))
+    return maps_in_camera(depth * (confidence > 0), sigma, Camera(K), camera)
 
 
 def check(folder):
-    seen_m = np.load(folder / "depth_reprojected.npy")
-    np.testing.assert_array_equal(seen_m, expected_of(folder))
-    whole = np.asarray(Image.open(folder / "depth_reprojected_mm.png"))
-    assert whole.dtype == np.uint16 and whole.shape == (56, 80)
+    seen_m, sigma_m = (np.load(folder / f"{name}_reprojected.npy") for name in ("depth", "sigma"))
+    np.testing.assert_array_equal((seen_m, sigma_m), expected_of(folder))
+    np.testing.assert_array_equal(np.isfinite(sigma_m), seen_m > 0)
+    whole, whole_sigma = (
+        np.asarray(Image.open(folder / f"{name}_reprojected_mm.png")) for name in ("depth", "sigma")
+    )
+    assert whole.dtype == whole_sigma.dtype == np.uint16 and whole.shape == whole_sigma.shape == (56, 80)
     np.testing.assert_allclose(whole / 1000, np.where(seen_m < 65.5, seen_m, 0), atol=6e-4)
+    expected = np.minimum(np.ceil(1000 * sigma_m.astype(np.float64)), 65535)
+    np.testing.assert_array_equal(whole_sigma, np.nan_to_num(expected))
     fraction = report_of(folder)["reproject"]["known_fraction"]
     assert fraction > 0.3 and fraction == pytest.approx((seen_m > 0).mean(), abs=1e-4)
 
@@ -45,7 +55,8 @@ def test_a_pair_is_written_as_the_other_camera_sees_it(pair_files, geodiff, tmp_
     answer = geodiff(*words)
     assert answer.code == 0, answer.err
     check(tmp_path / "o")
-    assert "depth_reprojected_mm.png" in report_of(tmp_path / "o")["files"]["names"]
+    files = {f"{name}_reprojected{kind}" for name in ("depth", "sigma") for kind in (".npy", "_mm.png")}
+    assert files <= set(report_of(tmp_path / "o")["files"]["names"])
 
 
 def test_the_text_of_a_realsense_is_the_camera_of_its_colour_images(pair_files, geodiff, tmp_path):
@@ -105,9 +116,13 @@ def test_a_bag_has_the_depth_and_the_camera_of_that_camera(geodiff, textured_pla
         read = {c.topic: reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()}
     image, info = read["/depth/image"], read["/depth/camera_info"]
     assert image.header.frame_id == info.header.frame_id == "colour"
-    values = image.data.view(np.uint16).reshape(image.height, image.width)
-    seen_m = expected_of(tmp_path / "d-frames/000001")
+    sigma = read["/depth/sigma"]
+    assert sigma.header == image.header and sigma.encoding == "16UC1"
+    values, sigma_values = (x.data.view(np.uint16).reshape(x.height, x.width) for x in (image, sigma))
+    seen_m, sigma_m = expected_of(tmp_path / "d-frames/000001")
     np.testing.assert_allclose(values / 1000, np.where(seen_m < 65.5, seen_m, 0), atol=6e-4)
+    expected = np.minimum(np.ceil(1000 * sigma_m.astype(np.float64)), 65535)
+    np.testing.assert_array_equal(sigma_values, np.nan_to_num(expected))
     np.testing.assert_array_equal(info.k.reshape(3, 3), K_TO)
 
 
@@ -162,8 +177,7 @@ def test_masked_pixels_are_in_no_file_unless_they_are_filled(pair_files, geodiff
     depth_m = np.load("o/depth.npy")
     assert (depth_m[valid] > 0).all() and (depth_m[~valid] > 0).all() == fill == (depth_m[~valid] > 0).any()
     K = np.reshape(report_of("o")["K"], (3, 3))
-    seen_m, expected_m = np.load("o/depth_reprojected.npy"), expected_of(tmp_path / "o")
-    np.testing.assert_array_equal(seen_m, expected_m)
+    check(tmp_path / "o")
     points = np.asarray(trimesh.load("o/mesh.glb", force="mesh").vertices)
     column = K[0, 0] * points[:, 0] / np.abs(points[:, 2]) + K[0, 2]
     assert (column < 19).any() == fill

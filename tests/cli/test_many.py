@@ -379,15 +379,32 @@ def test_the_video_of_a_rig(geodiff, fresh, textured_plane, videos):
     report = report_of("out/000001")
     assert report["pair"]["frame"] == 1 and report["inputs"]["right_size"] == [64, 48]
     alone = [np.load(f"out/{name}/depth.npy") for name in ("000000", "000001")]
+    images = [
+        Path(f"out/{name}/{file}.png") for name in ("000000", "000001") for file in ("depth", "overview")
+    ]
+    before = [image.read_bytes() for image in images]
     for _ in range(2):  # again from what the frames gave alone
         answer = geodiff("depth", *videos, *words, "--temporal-smoothing")
         assert answer.code == 0 and "2 already done" in answer.out, answer.err
+    with open("out/pairs.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
     for name, depth in zip(("000000", "000001"), alone, strict=True):
         assert np.array_equal(np.load(f"out/{name}/depth_alone.npy"), depth)
-        temporal_smoothing, confirmed = (np.load(f"out/{name}/{file}.npy") for file in ("depth", "confirmed"))
-        assert report_of(f"out/{name}")["temporal_smoothing"] == {"scene": 0}
-        assert confirmed.mean() > 0.5 and 0 < np.abs(np.log(temporal_smoothing / depth)).max() < 0.1
+        smoothed, confirmed = (np.load(f"out/{name}/{file}.npy") for file in ("depth", "confirmed"))
+        report = report_of(f"out/{name}")
+        assert report["temporal_smoothing"]["scene"] == 0
+        of_alone = report["temporal_smoothing"]["alone"]["depth"]
+        for entry, of_map in ((of_alone, depth), (report["depth"], smoothed)):
+            assert entry["median_m"] == pytest.approx(float(np.median(of_map)))
+        row = next(row for row in rows if row["pair"] == name)
+        assert [float(row[f"{each}_m"]) for each in ("near", "median", "far")] == [
+            pytest.approx(report["depth"][f"{each}_m"]) for each in ("min", "median", "max")
+        ]
+        assert confirmed.mean() > 0.5 and 0 < np.abs(np.log(smoothed / depth)).max() < 0.1
+    assert all(image.read_bytes() != each for image, each in zip(images, before, strict=True))
     answer = geodiff("depth", *videos, *words, "--overwrite")  # nothing of --temporal-smoothing is left
-    assert answer.code == 0 and not list(Path("out").glob("*/*_alone.npy")), answer.err
+    assert answer.code == 0, answer.err
+    for name in ("*_alone.npy", "sigma*", "confidence.png"):
+        assert not list(Path("out").glob(f"*/{name}"))
     answer = geodiff("depth", *videos, *words, "--export", "colmap", "--overwrite")
     assert answer.code == 2 and "--export colmap does not support videos" in answer.err

@@ -142,8 +142,9 @@ def test_invalid_pixels_stay_out_of_another_camera(make_oracle):
     output = call(
         make_oracle, pair, *masked(pair, CIRCLE, np.zeros_like(pair.left)), mask=CIRCLE, right_mask=CIRCLE
     )
-    seen = output.reproject(pair.K, np.eye(4), SIZE[::-1])
-    assert (seen[0, ..., 0][~CIRCLE] == 0).all() and (seen > 0).any()
+    depth, sigma = (maps[0, ..., 0] for maps in output.reproject(pair.K, np.eye(4), SIZE[::-1]))
+    assert (depth[~CIRCLE] == 0).all() and (depth > 0).any()
+    np.testing.assert_array_equal(np.isfinite(sigma), depth > 0)
 
 
 @pytest.mark.parametrize(

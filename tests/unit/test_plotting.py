@@ -26,6 +26,7 @@ from geodiff_plugin.plotting import (
     depth_range,
     fraction_figure,
     grid,
+    measured_range,
     overview,
     shrunk,
     ticks,
@@ -161,6 +162,9 @@ def test_the_ends_of_the_colours_leave_two_per_cent_on_either_side():
     assert depth_range(np.full((2, 3), 2.0)) == pytest.approx((2, 2.02))
     assert depth_range(depth, near=200.0) == pytest.approx((200, 202))
     assert depth_range(depth, far=0.5) == pytest.approx((0.5 / 1.01, 0.5))
+    near_only = np.where(depth < 21, depth, 0)
+    assert measured_range(near_only, depth) == depth_range(near_only) == pytest.approx((1.4, 20.6), rel=1e-2)
+    assert measured_range(0 * depth, depth) == depth_range(depth), "nothing was measured"
     for near, far, said in (
         (2.0, 2.0, r"near \(--near\) must be less than far \(--far\); got 2 and 2"),
         (3.0, 2.0, "got 3 and 2"),

@@ -96,9 +96,12 @@ def test_depth_in_another_camera_is_made_of_each_image_with_its_own_k(kind):
     np.testing.assert_array_equal(
         np.asarray(output.valid).reshape(depths.shape), (depths > 0) & (confidence > 0)
     )
-    seen = output.reproject(K_into, into, (32, 26))
-    assert tuple(seen.shape) == ((2, 26, 32, 1) if kind == "numpy" else (2, 1, 26, 32))
-    seen = np.asarray(seen).reshape(2, 26, 32)
+    maps = output.reproject(K_into, into, (32, 26))
+    for each in maps:
+        assert tuple(each.shape) == ((2, 26, 32, 1) if kind == "numpy" else (2, 1, 26, 32))
+        assert each.dtype == output.prediction.dtype
+    seen, sigma = (np.asarray(each).reshape(2, 26, 32) for each in maps)
+    np.testing.assert_array_equal(np.isfinite(sigma), seen > 0)
     v, u = np.mgrid[:26, :32]
     rays = np.stack([(u - 15.0) / 40, (v - 12.0) / 44, np.ones(u.shape)], -1)
     normal = np.array([0.1, -0.05, 1.0])
@@ -107,6 +110,9 @@ def test_depth_in_another_camera_is_made_of_each_image_with_its_own_k(kind):
         known = seen[number] > 0
         assert 0.5 < known.mean() < 0.97, "what is unknown there has no depth"
         np.testing.assert_allclose(seen[number][known], expected[known], rtol=0.01)
+        own = np.asarray(output.sigma).reshape(depths.shape)[number] / depths[number]
+        assert np.nanmin(own) * 0.95 < np.nanmin(sigma[number] / expected)
+        assert np.nanmax(sigma[number] / expected) < np.nanmax(own) * 1.05
     without = MetricDepthOutput(prediction)
     np.testing.assert_array_equal(np.asarray(without.valid).reshape(depths.shape), depths > 0)
     with pytest.raises(AttributeError, match="no K"):

@@ -1,4 +1,4 @@
-"""Depth in another camera, against rays that are cast at the same walls."""
+"""Depth and sigma in another camera, against rays that are cast at the same walls."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import InputError, MetricDepthOutput
 from geodiff_plugin._internal import strips as _strips
-from geodiff_plugin._internal.reprojection import _above_surface, _samples_per_side, depth_in_camera
+from geodiff_plugin._internal.reprojection import _above_surface, _samples_per_side, maps_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
 
 K = np.array([[120.0, 0.5, 79.0], [0, 125.0, 58.0], [0, 0, 1]])
@@ -28,6 +28,12 @@ def pose(*turn_deg: float, at: tuple[float, ...] = (0.0, 0.0, 0.0)) -> np.ndarra
 
 def target(K: np.ndarray, E: np.ndarray, size: tuple[int, int]) -> PosedCamera:
     return PosedCamera(K, size, E=E)
+
+
+def depth_in_camera(depth: np.ndarray, camera: Camera, other: PosedCamera) -> np.ndarray:
+    seen, sigma = maps_in_camera(depth, None, camera, other)
+    assert sigma is None
+    return seen
 
 
 def cast(K: np.ndarray, E: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -104,12 +110,12 @@ def test_an_output_gives_its_depth_reprojected_another_camera():
     K_to, E, size = CAMERAS[2]
     expected = depth_in_camera(depth, Camera(K), target(K_to, E, size))
     arrays = MetricDepthOutput(prediction=np.stack([depth, 2 * depth])[..., None], K=np.stack([K, K]))
-    found = arrays.reproject(K_to, E, size)
-    assert found.shape == (2, 300, 400, 1)
+    found, sigma = arrays.reproject(K_to, E, size)
+    assert found.shape == (2, 300, 400, 1) and sigma is None
     np.testing.assert_array_equal(found[0, ..., 0], expected)
     tensors = MetricDepthOutput(prediction=torch.from_numpy(depth)[None, None], K=torch.from_numpy(K)[None])
-    found = tensors.reproject(torch.from_numpy(K_to), E[:3], list(size))
-    assert found.shape == (1, 1, 300, 400) and found.dtype == torch.float32
+    found, sigma = tensors.reproject(torch.from_numpy(K_to), E[:3], list(size))
+    assert found.shape == (1, 1, 300, 400) and found.dtype == torch.float32 and sigma is None
     np.testing.assert_array_equal(found[0, 0], expected)
 
 
@@ -273,3 +279,74 @@ def test_the_surface_is_known_inside_the_outermost_pixels():
     expected = 1 / (0.5 + 0.01 * x + 0.02 * y + 0.001 * x * y) - 1.7
     np.testing.assert_allclose(found[inside], expected[inside], rtol=1e-9)
     assert np.isinf(found[~inside]).all() and 0.5 < inside.mean() < 0.9
+
+
+def test_sigma_is_that_of_the_surface_that_wins():
+    """The two walls have different sigmas, also where one covers the other; each camera looks along its z."""
+    depth, points = cast(K, np.eye(4), SIZE)
+    on_screen = depth < 2.0 + 1e-6
+    sigma = np.where(on_screen, 0.01, 0.3)
+    for K_to, E, size in CAMERAS:
+        seen, found = maps_in_camera(depth, sigma, Camera(K), target(K_to, E, size))
+        assert found.shape == seen.shape and found.dtype == np.float32
+        np.testing.assert_array_equal(np.isfinite(found), seen > 0)
+        ground_truth, at = cast(K_to, E, size)
+        shows_screen = np.abs(at[..., 2] - 2.0) < 1e-6
+        # The depth of a point ``z r`` along the other camera's z axis is ``z (axis . r) - axis . t``.
+        expected = np.where(shows_screen, 0.01, 0.3) * (at / at[..., 2:] @ E[:3, 2])
+        around = np.ones((5, 5), np.uint8)
+        alone = cv2.dilate(ground_truth, around) < 1.3 * cv2.erode(ground_truth, around)
+        there = (seen > 0) & alone & ~hidden(at)
+        assert there.mean() > 0.4 and 0.02 < shows_screen[there].mean() < 0.98
+        close = np.abs(found / expected - 1)[there] < 0.01
+        assert close.mean() > 0.995
+
+
+def test_sigma_is_multiplied_by_the_change_of_depth_along_the_other_z_axis():
+    """Of one point after the other: its depth is changed a little, and projected by hand."""
+    depth = cast(K, np.eye(4), SIZE)[0]
+    sigma = np.random.default_rng(0).uniform(0.01, 0.2, depth.shape)
+    camera = target(K, pose(0, 25, 0), SIZE)
+    seen, found = maps_in_camera(depth, sigma, Camera(K), camera)
+    row, column = 60, 140
+    ray = np.linalg.inv(K) @ [column, row, 1]
+    shift = 1e-4
+    near, far = ((ray * (depth[row, column] + step)) @ camera.E[:3, :3] for step in (0, shift))
+    u, v = np.rint((K @ near / near[2])[:2]).astype(int)
+    change = (far - near)[2] / shift
+    assert abs(change - 1) > 0.1 and abs(seen[v, u] / near[2] - 1) < 0.01
+    around = sigma[row - 1 : row + 2, column - 1 : column + 2] * change
+    assert np.isclose(found[v, u], around, rtol=0.01).any()
+    backwards = target(K, pose(0, 180, 0, at=(0, 0, 9)), SIZE)  # it looks at the walls from behind
+    seen, found = maps_in_camera(depth, np.full_like(depth, 0.1), Camera(K), backwards)
+    np.testing.assert_allclose(found[seen > 0], 0.1, rtol=1e-6)
+
+
+def test_an_unknown_sigma_and_pixels_without_depth_have_none():
+    depth = np.full((40, 60), 2.0)
+    sigma = np.full((40, 60), 0.1)
+    depth[10:20, 15:30], sigma[25:30, 5:12] = 0, np.nan
+    seen, found = maps_in_camera(depth, sigma, Camera(K), target(K, np.eye(4), (60, 40)))
+    np.testing.assert_array_equal(seen == 0, depth == 0)
+    np.testing.assert_allclose(found, np.where(depth > 0, sigma, np.nan), rtol=1e-6)
+    seen, found = maps_in_camera(0 * depth, sigma, Camera(K), target(K, np.eye(4), (60, 40)))
+    assert not seen.any() and np.isnan(found).all()
+
+
+@pytest.mark.parametrize("scale", [0.4, 6.0])
+def test_sigma_of_another_resolution_is_that_of_the_nearest_pixel(scale):
+    rng = np.random.default_rng(1)
+    depth, sigma = np.full((30, 40), 2.0), rng.uniform(0.01, 0.5, (30, 40)).astype(np.float32)
+    size = int(40 * scale), int(30 * scale)
+    camera = Camera(K, (40, 30)).resized(size)
+    seen, found = maps_in_camera(depth, sigma, Camera(K), target(camera.K, np.eye(4), size))
+    assert (seen > 0).mean() > 0.8
+    rows, columns = np.nonzero(seen)
+    off_px = 0.5 + 0.7 / min(scale, 1)
+    for row, column in zip(rows[::7], columns[::7], strict=True):
+        y, x = ((at + 0.5) / scale - 0.5 for at in (row, column))
+        near = sigma[
+            max(0, int(np.ceil(y - off_px))) : int(y + off_px) + 1,
+            max(0, int(np.ceil(x - off_px))) : int(x + off_px) + 1,
+        ]
+        assert np.isin(found[row, column], near), (row, column)

@@ -742,6 +742,7 @@ def model(tmp_path, monkeypatch):
         "poses": (),
         "verdict": judge(FactSheet()),
         "findings": (),
+        "measurable_m": torch.tensor([7.5]),
     }
     depth = depth_by(lambda capture: length(capture.solve().E) / length(TRUE), **entries)
 
@@ -786,7 +787,8 @@ def test_one_length_scales_all_and_without_one_there_are_no_metres(way, model, t
     texts = [summary(report, options.out), cloud, capsys.readouterr().err]
     texts = [text.replace("for metres pass", "") for text in texts]  # how to get them
     assert any(" m " in text or "metres" in text for text in texts) is bool(way)
-    assert report["unit"] == json.loads((tmp_path / "out/f04/report.json").read_text())["unit"]
+    of_frame = json.loads((tmp_path / "out/f04/report.json").read_text())
+    assert report["unit"] == of_frame["unit"] and of_frame["measurable_m"] == 7.5
     assert report["unit"] == ("m" if way else None)
     monkeypatch.setattr(capture_frame, "write_maps", lambda *_: pytest.fail("done before"))
     assert [message["text"] for message in report["findings"]] == list(solved().findings)

@@ -355,6 +355,13 @@ def finished(tmp_path) -> Capture:
 DRAW_DEPTH = plotting.depth_figure
 
 
+def range_of(out) -> tuple[float, float]:
+    """Ends of the colours of all frames, by every eighth pixel of each row and column."""
+    maps = [[each[::8, ::8] for each in maps_of(out, name)] for name in NAMES]
+    values = np.concatenate([depth[confidence > 0] for depth, confidence, *_ in maps])
+    return tuple(np.percentile(values, (2, 98)))
+
+
 @pytest.fixture
 def plain_figures(monkeypatch):
     """Figures of depth take most of the time of a run. Other tests look at them."""
@@ -398,7 +405,7 @@ def test_agreement_of_finished_frames_is_written_and_its_fractions_match_the_fil
         whole = np.asarray(Image.open(out / name / "depth_mm.png"))
         np.testing.assert_array_equal(whole == 0, maps[1] == 0)
         assert np.abs(whole - 1000.0 * maps[0])[whole > 0].max() < 0.51 and (whole == 0).any()
-        drawn = plotting.depth_figure(maps[0], unit="m")
+        drawn = plotting.depth_figure(maps[0], *np.percentile(maps[0][maps[1] > 0], (2, 98)), unit="m")
         np.testing.assert_array_equal(np.asarray(Image.open(out / name / "depth.png")), np.asarray(drawn))
     assert not (out / "b" / "depth.npy").exists()
 
@@ -471,9 +478,16 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
     """Depth by a run is kept on first use. The second scene has a frame more than the first."""
     frames, images, ground_truths = finished_video(tmp_path)
     before = [np.load(frame.folder / "depth.npy") for frame in frames]
-    assert results.write_smoothed(frames, images.__getitem__) == [0, 0, 1, 1, 1]
+    written_maps = []
+    for i, (scene, maps) in enumerate(results.write_smoothed(frames, images.__getitem__)):
+        assert scene == (i > 1)
+        written_maps.append(maps)
     temporal_smoothing = [np.load(frame.folder / "depth.npy") for frame in frames]
     for i, frame in enumerate(frames):
+        for name in ("depth", "confidence", "sigma", "confirmed", "observers"):
+            np.testing.assert_array_equal(
+                np.load(frame.folder / f"{name}.npy"), getattr(written_maps[i], name)
+            )
         np.testing.assert_array_equal(np.load(frame.folder / "depth_alone.npy"), before[i])
         sure = np.load(frame.folder / "confidence_alone.npy")
         np.testing.assert_array_equal(sure, np.full(sure.shape, 0.1 + 0.2 * i if i else 0.5, np.float32))
@@ -484,7 +498,7 @@ def test_finished_frames_of_a_video_are_smoothed_and_the_same_call_again_changes
         ]
         assert off[0] < 0.8 * off[1]
         assert np.median(np.load(frame.folder / "observers.npy")[middle]) == (1 if i < 2 else 2)
-    results.write_smoothed(frames, images.__getitem__)
+    list(results.write_smoothed(frames, images.__getitem__))
     for frame, depth in zip(frames, temporal_smoothing, strict=True):
         np.testing.assert_array_equal(np.load(frame.folder / "depth.npy"), depth)
 
@@ -509,10 +523,10 @@ def test_depths_that_are_not_reliable_after_smoothing_are_removed(plain_figures,
         depth, sigma = (np.load(frame.folder / f"{name}.npy") for name in ("depth", "sigma"))
         return (depth > 0) & ~(sigma <= limits.max_sigma)
 
-    results.write_smoothed(frames, images.__getitem__)
+    list(results.write_smoothed(frames, images.__getitem__))
     assert above(frames[3])[blob].mean() > 0.9, "smoothing alone violates the limit"
     kept = [~above(frame) for frame in frames]
-    results.write_smoothed(frames, images.__getitem__, limits)
+    list(results.write_smoothed(frames, images.__getitem__, limits))
     for frame, mask in zip(frames, kept, strict=True):
         maps = {name: np.load(frame.folder / f"{name}.npy") for name in ("depth", "confidence", "sigma")}
         np.testing.assert_array_equal(maps["depth"] > 0, mask)
@@ -659,7 +673,7 @@ def test_a_capture_without_any_reliable_depth_has_an_empty_cloud(finished, plain
 def test_the_sheet_has_every_frame_and_its_depth_and_marks_those_that_are_not_trusted(
     finished, tmp_path, monkeypatch
 ):
-    """Frames of different sizes have colours of their own; of frames of one size those of a common range."""
+    """All depth is drawn in the colours of one range, also if frames have different sizes."""
     sheets, grid = [], plotting.grid
     monkeypatch.setattr(
         plotting,
@@ -671,28 +685,31 @@ def test_the_sheet_has_every_frame_and_its_depth_and_marks_those_that_are_not_tr
     assert titles == ["a", "depth", "b", "depth", "c", "depth, not trusted", "d", "depth"]
     for number, name in enumerate(NAMES):
         np.testing.assert_allclose(cells[2 * number], image_of(number), atol=1e-6)
-        drawn = plotting.depth_figure(np.load(out / name / "depth.npy"), unit="m")
+        drawn = plotting.depth_figure(np.load(out / name / "depth.npy"), *range_of(out), unit="m")
         np.testing.assert_array_equal(np.asarray(cells[2 * number + 1]), np.asarray(drawn))
     with Image.open(out / "sheet.jpg") as sheet:
         assert sheet.size == grid(cells, titles, columns=4, cell_width=360).size
-    results._sheet(finished, out, ["b"], [])
+    results._sheet(finished, out, ["b"], [], (1.0, 2.0))
     with Image.open(out / "sheet.jpg") as sheet:
         assert sheet.size == grid(*sheets[-1], columns=2, cell_width=360).size
-    drawn, names = [], [f"{i:02d}" for i in range(60)]
+    drawn, names, ends = [], [f"{i:02d}" for i in range(60)], (1.5, 300.0)
     depths = np.random.default_rng(0).uniform(1, 9, (60, 8, 10)).astype(np.float32)
     for name, depth in zip(names, depths, strict=True):
         (tmp_path / name).mkdir()
         np.save(tmp_path / name / "depth.npy", depth * (1 + int(name)))
     monkeypatch.setattr(finished, "image", lambda name: np.full((8, 10, 3), int(name) / 60))
-    few = [Image.new("RGB", (8, 6))] * 24
-    monkeypatch.setattr(plotting, "depth_frames", lambda depths, unit: drawn.append((depths, unit)) or few)
-    results._sheet(finished, tmp_path, names, [])
+    monkeypatch.setattr(
+        plotting,
+        "depth_figure",
+        lambda *given, unit: drawn.append((*given, unit)) or Image.new("RGB", (8, 6)),
+    )
+    results._sheet(finished, tmp_path, names, [], ends)
     shown = sheets[-1][1][::2]
     assert len(shown) == 24 and shown[0] == "00" and shown[-1] == "59"
     assert set(np.diff([int(name) for name in shown])) == {2, 3}
-    together, unit = drawn[-1]
-    assert unit == "m" and len(sheets[-1][0]) == 48
-    np.testing.assert_array_equal(together, [np.load(tmp_path / name / "depth.npy") for name in shown])
+    assert len(sheets[-1][0]) == 48 and {given[1:] for given in drawn} == {(*ends, "m")}
+    for name, (depth, *_) in zip(shown, drawn, strict=True):
+        np.testing.assert_array_equal(depth, np.load(tmp_path / name / "depth.npy"))
 
 
 def test_the_video_shows_images_next_to_depth_in_the_colours_of_one_range(
@@ -708,7 +725,7 @@ def test_the_video_shows_images_next_to_depth_in_the_colours_of_one_range(
     ((path, frames, fps),) = videos
     assert path == out / "video.mp4" and fps == 5 and len(frames) == 4
     maps = [np.load(out / name / "depth.npy") for name in NAMES]
-    near, far = np.percentile(np.concatenate([depth[::8, ::8].ravel() for depth in maps]), (2, 98))
+    near, far = range_of(out)
     for number, frame in enumerate(frames):
         assert frame.size == (1280, 480)
         drawn = DRAW_DEPTH(maps[number], near, far, unit=finished.unit)
@@ -723,6 +740,50 @@ def test_the_video_shows_images_next_to_depth_in_the_colours_of_one_range(
         left, top = (1280 - shown.shape[1]) // 2, (480 - shown.shape[0]) // 2
         inside = np.asarray(frame)[top : top + shown.shape[0], left : left + shown.shape[1]]
         assert np.abs(inside.astype(int) - shown).mean() < 4
+
+
+def test_colours_of_all_frames_end_at_the_farthest_measured_depth(finished, plain_figures, tmp_path):
+    """A sky, which is too far to be measured, and depths without confidence do not stretch them."""
+    out = tmp_path / "out"
+    for number, name in enumerate(NAMES):
+        (out / name / "report.json").write_text(json.dumps({"measurable_m": 20.0 + number}))
+        depth, confidence = (np.load(out / name / f"{kind}_alone.npy") for kind in ("depth", "confidence"))
+        depth[:20], confidence[:20] = 500.0, 0.2
+        depth[20:24], confidence[20:24] = 20.0 + number + 0.5, 0.9
+        results.save_alone(out / name, depth, confidence, np.full_like(depth, 0.1))
+    results.write_agreement(finished, out, NAMES)
+    near, far = results._common_range(out, NAMES)
+    measured = []
+    for number, name in enumerate(NAMES):
+        depth, confidence, *_ = (each[::8, ::8] for each in maps_of(out, name))
+        measured.append(depth[(confidence > 0) & (depth < 20.0 + number)])
+    assert far < 10 and (np.load(out / "d/depth.npy") > 400).mean() > 0.3
+    np.testing.assert_allclose((near, far), np.percentile(np.concatenate(measured), (2, 98)))
+    for name in NAMES:  # by an earlier version
+        (out / name / "report.json").write_text("{}")
+    assert results._common_range(out, NAMES)[1] > 400
+
+
+def test_the_colours_of_a_frame_end_at_its_farthest_measured_depth(finished, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        plotting, "depth_figure", lambda *given, unit: drawn.append(given) or Image.new("RGB", (8, 6))
+    )
+    depth = np.full((40, 50), 3.0, np.float32)
+    depth[:10], depth[10:14], depth[14:30] = 600.0, 80.0, np.linspace(1, 5, 50)
+    confidence = np.full_like(depth, 0.8)
+    confidence[:10] = 0.0
+    folder = tmp_path / "f0"
+    folder.mkdir()
+    (folder / "report.json").write_text('{"measurable_m": 70.0}')
+    results.save_alone(folder, depth, confidence, np.full_like(depth, 0.1))
+    image = np.random.default_rng(0).random((40, 50, 3), np.float32)
+    list(results.write_smoothed([FinishedFrame(folder, KS[0], "m")], lambda i: image))
+    ((_, near, far),) = drawn
+    np.testing.assert_allclose((near, far), np.percentile(depth[14:], (2, 98)))
+    (folder / "report.json").write_text('{"measurable_m": 0.5}')  # nothing can be measured
+    list(results.write_smoothed([FinishedFrame(folder, KS[0], "m")], lambda i: image))
+    np.testing.assert_allclose(drawn[-1][1:], np.percentile(depth, (2, 98)))
 
 
 class StandInGrid:

@@ -133,6 +133,21 @@ def test_pngs_are_written_whole_by_run_lengths(tmp_path):
         np.testing.assert_array_equal(np.asarray(image), values)
 
 
+def test_a_png_that_cannot_be_written_leaves_the_earlier_one(tmp_path, monkeypatch):
+    path = tmp_path / "a.png"
+    save_png(Image.new("RGB", (5, 4), "red"), path)
+    before = path.read_bytes()
+
+    def torn(self, file, **options):
+        Path(file).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", torn)
+    with pytest.raises(OSError, match="No space"):
+        save_png(Image.new("RGB", (5, 4), "blue"), path)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
 def test_maps_are_found_by_their_suffix_in_order(tmp_path):
     assert find_map(tmp_path, "a") is None
     (tmp_path / "a.npy").mkdir()

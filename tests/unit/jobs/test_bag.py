@@ -36,6 +36,8 @@ def run(tmp_path, monkeypatch):
             folder.mkdir(parents=True, exist_ok=True)
             np.save(folder / "depth.npy", made_runs.depth_map() + n)
             np.save(folder / "depth_reprojected.npy", np.full((24, 28), 1.5 + n, np.float32))
+            if n:
+                np.save(folder / "sigma_reprojected.npy", np.full((24, 28), 0.5, np.float32))
             (folder / "report.json").write_text(f'{{"K": [{(made_runs.K_LEFT + n).tolist()}]}}')
         confidence = np.ones((36, 50), np.float32)
         confidence[4] = 0.0
@@ -125,7 +127,10 @@ def test_images_of_another_camera_have_its_frame_and_its_k(run, tmp_path):
     assert frame_id == "reprojected"
     for n, frame in zip((0, 2), frames, strict=True):
         np.testing.assert_array_equal(frame[1], np.full((24, 28), 1.5 + n))
-        assert frame.sigma_m is None, "it belongs to the left camera"
+        if n:
+            np.testing.assert_array_equal(frame.sigma_m, np.full((24, 28), 0.5))
+        else:
+            assert frame.sigma_m is None, "of a preset without confidence"
         np.testing.assert_allclose(frame[2], [[30, 0, 13], [0, 32, 11], [0, 0, 1]])
 
 

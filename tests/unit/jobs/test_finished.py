@@ -155,8 +155,13 @@ def test_the_row_of_a_pair_matches_its_report():
         "reasons": "",
         "codes": "pose.refined points.few camera.assumed-intrinsics",
     }
+    smoothed = row_of(REPORT | {"temporal_smoothing": {"confidence_mean": 0.9375}})
+    assert smoothed == row_of(REPORT) | {"confidence": 0.9375}
+    unknown = REPORT["verdict"] | {"facts": {}}
+    row = row_of(REPORT | {"verdict": unknown, "temporal_smoothing": {"confidence_mean": 0.5}})
+    assert row["confidence"] is None, "of a preset without confidence"
     doubted = REPORT["verdict"] | {"status": "not trusted", "reasons": ["E is wrong.", "So is K."]}
-    row = row_of(REPORT | {"verdict": doubted, "findings": []})
+    row = row_of(REPORT | {"verdict": doubted, "findings": [], "temporal_smoothing": {"confidence_mean": 1}})
     assert row["confidence"] is row["message"] is row["codes"] is None
     assert (row["verdict"], row["reasons"]) == ("not trusted", "E is wrong. So is K.")
     assert row_of({name: REPORT[name] for name in REPORT if name != "findings"})["codes"] is None

@@ -1,5 +1,6 @@
 """A run over many pairs: what each stage is given, what counts as finished, and the rows of its table."""
 
+import csv
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -370,7 +371,11 @@ def test_smoothed_frames_are_those_that_did_not_fail(tmp_path, monkeypatch, alon
 
     def note(asked, refs, views, notify):
         temporal_smoothing.append((asked.temporal_smoothing, [ref.name for ref in refs], notify))
+        assert (tmp_path / "out/pairs.csv").is_file(), "it remains if this fails"
+        depths = [{"min_m": n, "median_m": n + 1, "max_m": n + 2} for n in (5, 7)]
+        return [{"depth": depth, "verdict": verdict} for depth in depths]
 
+    verdict = {"status": "trusted", "facts": {"matched_fraction": {"confidence": 0.125}}}
     monkeypatch.setattr(many, "write_smoothed_frames", note)
 
     def stage(item):
@@ -378,8 +383,14 @@ def test_smoothed_frames_are_those_that_did_not_fail(tmp_path, monkeypatch, alon
             raise ValueError("torn")
         return dict(ROW)
 
-    depth_pairs(tmp_path, monkeypatch, stage, temporal_smoothing=True)
+    rows, _ = depth_pairs(tmp_path, monkeypatch, stage, temporal_smoothing=True)
     assert temporal_smoothing == [(True, ["a", "c"], silent)]
+    names = ("near_m", "median_m", "far_m", "confidence", "result")
+    figures = [tuple(row[name] for name in names) for row in rows]
+    assert figures == [(5, 6, 7, 0.125, "done"), (*[None] * 4, "failed"), (7, 8, 9, 0.125, "done")]
+    with open(tmp_path / "out/pairs.csv", newline="") as file:
+        table = [tuple(row[name] for name in names) for row in csv.DictReader(file)]
+    assert table == [tuple("" if value is None else str(value) for value in each) for each in figures]
 
 
 def test_ray_makes_the_records_where_it_is_the_engine(tmp_path, monkeypatch, alone):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from geodiff_plugin.evidence.unposed import EstimatedRig
+from geodiff_plugin.formats.out import read_report
 from geodiff_plugin.jobs.report import (
     build_report,
     depth_range_words,
@@ -17,7 +18,6 @@ from geodiff_plugin.jobs.report import (
     measurable_limit,
     measured_depth,
     plain,
-    read_report,
     report_text,
     summary_line,
     used_poses,
@@ -114,6 +114,12 @@ def test_the_expected_error_is_the_median_sigma_of_known_depths(run, report):
     for changes in ({"confidence": None}, {"confidence": 0 * run.output.confidence}):
         unknown = replace(run, output=replace(run.output, **changes))
         assert build_report(unknown)["sigma_median_m"] is None
+
+
+def test_the_farthest_measurable_depth_is_in_it(run, report):
+    assert report["measurable_m"] is None
+    output = replace(run.output, measurable_m=torch.tensor([71.5]))
+    assert build_report(replace(run, output=output))["measurable_m"] == 71.5
 
 
 def test_what_the_call_gave_stands_under_its_own_name(run, report):

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import plotting
+from geodiff_plugin.cameras import Camera
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.formats.target import read_target_camera
 from geodiff_plugin.jobs import writing
@@ -291,9 +292,8 @@ def test_depth_in_another_camera_is_that_of_the_same_points(tmp_path):
     normal, offset = np.array([0.1, -0.05, 1.0]), 2.5  # n . x = d
     v, u = np.mgrid[:60, :80]
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
-    reported = write_reprojected(
-        tmp_path, (offset / (rays @ normal)).astype(np.float32), K, read_target_camera(path)
-    )
+    depth_m = (offset / (rays @ normal)).astype(np.float32)
+    reported = write_reprojected(tmp_path, depth_m, 0.02 * depth_m, Camera(K), read_target_camera(path))
     E, K_into = np.array(camera["E"]), np.array(camera["K"], float)
     v, u = np.mgrid[:24, :28]
     rays = np.stack([u, v, np.ones(u.shape)], -1) @ np.linalg.inv(K_into).T @ E[:3, :3].T
@@ -303,6 +303,13 @@ def test_depth_in_another_camera_is_that_of_the_same_points(tmp_path):
     np.testing.assert_allclose(seen_m[seen_m > 0], expected[seen_m > 0], rtol=5e-3)
     millimetres = np.asarray(Image.open(tmp_path / "depth_reprojected_mm.png"))
     np.testing.assert_array_equal(millimetres, np.rint(seen_m.astype(float) * 1000))
+    sigma_m = np.load(tmp_path / "sigma_reprojected.npy")
+    assert sigma_m.dtype == np.float32 and (np.isfinite(sigma_m) == (seen_m > 0)).all()
+    # The camera is 5 cm behind, so a point's depth is larger in it by more than that of the left camera.
+    relative = sigma_m[seen_m > 0] / seen_m[seen_m > 0]
+    assert relative.min() > 0.019 and relative.max() < 0.02
+    sigma_mm = np.asarray(Image.open(tmp_path / "sigma_reprojected_mm.png"))
+    np.testing.assert_array_equal(sigma_mm, np.nan_to_num(np.ceil(sigma_m.astype(float) * 1000)))
     known = round((seen_m > 0).sum() / seen_m.size, 4)
     np.testing.assert_allclose(reported.pop("E"), E, atol=1e-9)  # its rotation is made exactly orthogonal
     assert reported == {"K": K_into.tolist(), "size": [28, 24], "known_fraction": known}
@@ -324,12 +331,20 @@ def test_a_pair_is_written_with_all_that_its_options_ask_for(run, tmp_path):
     assert report["seconds"]["calibration"] == 0.125 and report["seconds"]["guided call"] == 2.5
     assert not (tmp_path / "out/undistorted.png").exists()
     valid = one_map(run.output.valid)
-    expected = write_reprojected(
-        tmp_path, one_map(run.output.prediction) * valid, made_runs.K_LEFT, options.target_camera()
-    )
+    maps = one_map(run.output.prediction) * valid, one_map(run.output.sigma)
+    camera = Camera(made_runs.K_LEFT)
+    expected = write_reprojected(tmp_path, *maps, camera, options.target_camera())
     assert report["reproject"] == expected
-    into = [np.load(folder / "depth_reprojected.npy") for folder in (tmp_path, tmp_path / "out")]
-    np.testing.assert_array_equal(*into)
+    for name in ("depth", "sigma"):
+        into = [np.load(folder / f"{name}_reprojected.npy") for folder in (tmp_path, tmp_path / "out")]
+        np.testing.assert_array_equal(*into)
+
+
+def test_a_pair_without_confidence_has_no_sigma_in_another_camera(run, tmp_path):
+    options = replace(run.options, reproject=target(tmp_path))
+    write(replace(run, options=options, output=made_runs.output(confidence=None)), tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert set(writing.DEPTH_REPROJECTED) <= names and not any(name.startswith("sigma") for name in names)
 
 
 def test_the_row_of_a_pair_is_that_of_the_report_which_is_written(run, tmp_path):
@@ -342,4 +357,5 @@ def test_the_row_of_a_pair_is_that_of_the_report_which_is_written(run, tmp_path)
     )
     assert row["seconds"] == pytest.approx(sum(report["seconds"].values()), abs=1e-3)
     assert row["verdict"] == "not trusted" and row["message"] == f"{made_runs.REMARK} {made_runs.WARNED}"
-    assert writing.REPROJECTED_FILES == ("depth_reprojected.npy", "depth_reprojected_mm.png")
+    assert writing.DEPTH_REPROJECTED == ("depth_reprojected.npy", "depth_reprojected_mm.png")
+    assert writing.SIGMA_REPROJECTED == ("sigma_reprojected.npy", "sigma_reprojected_mm.png")

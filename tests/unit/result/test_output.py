@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin._internal.camera_checks import check_posed_camera
-from geodiff_plugin._internal.reprojection import depth_in_camera
+from geodiff_plugin._internal.reprojection import maps_in_camera
 from geodiff_plugin.cameras import Camera, PosedViews
 from geodiff_plugin.capture.results import _write_agreed
 from geodiff_plugin.evidence.evidence import Evidence
@@ -327,9 +327,11 @@ def test_another_camera_does_not_see_it():
     E, size = np.eye(4), (64, 48)
     camera = check_posed_camera(K, E, size)
     unknown = np.where(output().valid, output().prediction, 0.0)[0, ..., 0]
-    seen = output().reproject(K, E, size)[0, ..., 0]
-    np.testing.assert_array_equal(seen, depth_in_camera(unknown, Camera(K), camera))
+    seen, sigma = (maps[0, ..., 0] for maps in output().reproject(K, E, size))
+    expected = maps_in_camera(unknown, output().sigma[0, ..., 0], Camera(K), camera)
+    np.testing.assert_array_equal((seen, sigma), expected)
     assert (seen[:9] == 0).all() and (seen[12:40] == 2.0).all()
+    np.testing.assert_array_equal(np.isfinite(sigma), seen > 0)
 
 
 @END_TO_END

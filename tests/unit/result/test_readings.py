@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from geodiff_plugin.result.readings import Reading, distance_m, metres, read_pixel
+from geodiff_plugin.result.readings import Reading, beyond_limit, distance_m, measured, metres, read_pixel
 
 K = np.array([[50.0, 0.7, 21.0], [0, 40.0, 13.0], [0, 0, 1]])
 DEPTH = np.random.default_rng(0).uniform(1.0, 9.0, (24, 37))
@@ -100,3 +100,14 @@ def test_two_readings_of_one_point_differ_by_their_own_errors():
 )
 def test_lengths_as_text(value, spread, unit, text):
     assert metres(value, spread, unit) == text
+
+
+def test_depths_that_are_invalid_or_too_far_are_not_measured():
+    depth = np.array([[0.0, 3.0, 70.0, 70.5, np.nan, np.inf]])
+    valid = np.array([[True, True, True, True, False, False]])
+    np.testing.assert_array_equal(beyond_limit(depth, 70.0), [[False, False, False, True, False, False]])
+    assert not beyond_limit(depth, None).any()
+    np.testing.assert_array_equal(measured(depth, valid, 70.0), [[0, 3, 70, 0, 0, 0]])
+    np.testing.assert_array_equal(measured(depth, valid, None), [[0, 3, 70, 70.5, 0, 0]])
+    valid[0, 1] = False
+    np.testing.assert_array_equal(measured(depth, valid, 70.0), [[0, 0, 70, 0, 0, 0]])
