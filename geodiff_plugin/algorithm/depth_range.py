@@ -85,7 +85,7 @@ def fit_depth_range(
     for target in (evidence.matches, evidence.points):
         if target is not None:
             near, far = refine_to_matches(floored, target, near, far, space)
-    return DepthRange(*_within(near, far, config), on_edge)
+    return DepthRange(*within_range(near, far, config), on_edge)
 
 
 @torch.no_grad()
@@ -94,10 +94,10 @@ def refit_depth_range(
 ) -> DepthRange:
     """Refine the ``current`` range of one image's maps ``x (B, 1, h, w)`` to its weighted matches."""
     near, far = refine_to_matches(smooth_floor(x), matches, current.near_m, current.far_m, metric.space)
-    return DepthRange(*_within(near, far, config), current.on_edge)
+    return DepthRange(*within_range(near, far, config), current.on_edge)
 
 
-def _within(near: Tensor, far: Tensor, config: GuidanceConfig) -> tuple[Tensor, Tensor]:
+def within_range(near: Tensor, far: Tensor, config: GuidanceConfig) -> tuple[Tensor, Tensor]:
     """Clamp both ends to the given range, if any."""
     if config.depth_range is None:
         return near, far

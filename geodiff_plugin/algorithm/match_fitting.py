@@ -27,6 +27,7 @@ from geodiff_plugin.algorithm.constants import (
     MIN_SMOOTHNESS,
     MIN_TIKHONOV,
     NORMAL_QUANTILE,
+    OWN_DEPTH_WEIGHT,
     PASSES,
     REFERENCE_ERROR,
     REFERENCE_SIDE,
@@ -285,7 +286,12 @@ class DepthFit(NamedTuple):
 
 @torch.no_grad()
 def fit_depth(
-    depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, config: GuidanceConfig = DEFAULT
+    depth_m: Tensor,
+    target: Matches,
+    left_01: Tensor,
+    error: Tensor,
+    config: GuidanceConfig = DEFAULT,
+    own_scale: Tensor | None = None,
 ) -> DepthFit:
     """Fit log depth to matches by least squares, smooth except at edges.
 
@@ -305,11 +311,15 @@ def fit_depth(
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
         error: ``prior_error`` or ``local_error``; matches that contradict a good prior have a lower weight.
         config: parameters of the fit.
+        own_scale: ``(B, 1, 1, 1)``, 1 for a map that keeps its own scale, else 0; ``None`` for 0. Such a map
+            has this error in its depth, and not only in its depth relative to the depth around it.
     """
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)
     trusted = _stiff(observed, observed.weight, error, config).weights
     smoothness, tikhonov = _levels(error, config)
+    if own_scale is not None:
+        tikhonov = tikhonov.maximum(own_scale * OWN_DEPTH_WEIGHT * (config.match_sigma / error) ** 2)
     system = RobustSystem(
         data=observed.residual,
         trusted=trusted,

@@ -28,6 +28,7 @@ class Member:
     rank_correlation: Tensor | None  # (1,) of the prior's first map with matches or points; NaN for too few
     on_edge: Tensor | None  # (1,) bool, whether the scale search ended at the edge of its range
     prior_depth_m: Tensor | None  # (1, 1, h, w) metres, first estimate of a metric prior
+    own_scale: Tensor | None = None  # (1, 1, 1, 1) 1 if the map keeps its own scale, else 0
     certainty: Tensor | None = None  # (1, 1, h, w) of the right period on repeated patterns, in [0, 1]
 
     @property

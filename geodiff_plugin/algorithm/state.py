@@ -18,9 +18,16 @@ from geodiff_plugin.algorithm.depth_range import (
     refit_depth_range,
     search_one_number,
     span_of_points,
+    within_range,
 )
 from geodiff_plugin.algorithm.map_error import regional_error
-from geodiff_plugin.algorithm.match_fitting import fit_depth, fit_target, local_error, measure_error
+from geodiff_plugin.algorithm.match_fitting import (
+    MeasuredError,
+    fit_depth,
+    fit_target,
+    local_error,
+    measure_error,
+)
 from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.algorithm.optimizers import OPTIMIZERS, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.terms import Given, Loss, Objective
@@ -36,6 +43,9 @@ from geodiff_plugin.types import StepReport
 
 #: Number of times that the scale of a given map is refined without reflections: each finds further ones.
 REFITS = 2
+#: Maximum error of given maps with their own scale, relative to their error with the fitted one, and maximum
+#: median difference of both in log depth, with which their own scale is kept.
+OWN_ERROR, OWN_DIFFERENCE = 1.1, 0.07
 
 
 def _samples_of_images(image_of_sample: Sequence[int]) -> list[slice]:
@@ -91,6 +101,7 @@ class Trajectory:
     affine: AffineState  # after the latest update; set by ``find_scale``
     match_weight: Tensor | None = None  # (B, 1, H, W), factor on the confidence of matches
     certainty: Tensor | None = None  # (B, 1, H, W), ``Settled.certainty`` of the first estimate
+    own_scale: Tensor | None = None  # (B, 1, 1, 1), 1 for given maps that keep their own scale, else 0
     error: Tensor | None = None  # (B, 1, 1, 1), ``prior_error`` of the first estimate; per pixel if given
     occluded: Tensor | None = None  # (B, V, 1, H, W) bool, pixels occluded in the right views
     rank_correlation: Tensor | None = None  # (B,), of the prior's first map with matches or points
@@ -191,14 +202,18 @@ class Trajectory:
         """At the first estimate, find matches that look like reflections and measure the prior's error."""
         if self.error is not None or (self.matches is None and self.points is None):
             return
+        refits = self.maps.given and self.config.search == "volume" and self.matches is not None
         if self.matches is not None and self.match_weight is None:
             self._weigh_matches(self.matches, x)
-            if self.maps.given and self.config.search == "volume":
-                for _ in range(REFITS):
-                    self._refit_scale(x)
-                    self._weigh_matches(self.matches, x)
-        if self.config.fit_matches or self.config.refine_edges:
-            self.error = self._measure_error(self.objective.metric_depth(x, self.affine))
+            for _ in range(REFITS if refits else 0):
+                self._refit_scale(x)
+                self._weigh_matches(self.matches, x)
+        if not (self.config.fit_matches or self.config.refine_edges):
+            return
+        measured = self._measure_error(x)
+        if refits and self.maps.own_range is not None:
+            measured = self._with_own_scale(x, measured, self.maps.own_range)
+        self.error = self._regional_error(x, measured)
 
     def _weigh_matches(self, matches: Matches, x: Tensor) -> None:
         """Find the matches that are reflections of the estimate ``x``, or off by a period of a pattern."""
@@ -225,16 +240,50 @@ class Trajectory:
         near_m, far_m, _ = zip(*ranges, strict=True)
         self.affine = self._affine_start = self.metric.from_range(cat_samples(near_m), cat_samples(far_m))
 
-    def _measure_error(self, depth_m: Tensor) -> Tensor:
-        """Measure the prior's error, ``(B, 1, 1, 1)``, or ``(B, 1, H, W)`` for a given map and two views."""
-        target = self._target(depth_m)
+    def _with_own_scale(self, x: Tensor, fitted: MeasuredError, own_range: DepthRange) -> MeasuredError:
+        """Keep the own scale of given maps in metres that fits the matches as well as the fitted one does.
+
+        Returns the error with the chosen scale. A fit is biased by the matches' common errors, and a good
+        map in metres is more accurate than that.
+        """
+        assert self.matches is not None and self.match_weight is not None
+        affine, weight, certainty = self.affine, self.match_weight, self.certainty
+        fitted_m = self.objective.metric_depth(x, affine)
+        known = own_range.near_m.isfinite()
+        ends = zip(own_range[:2], self.metric.range_of(affine), strict=True)
+        near_m, far_m = (torch.where(known, own, fitted) for own, fitted in ends)
+        self.affine = self.metric.from_range(*within_range(near_m, far_m, self.config))
+        self._weigh_matches(self.matches, x)
+        own = self._measure_error(x)
+        ratio = self.objective.metric_depth(x, self.affine) / fitted_m
+        difference = ratio.log().abs().flatten(1).median(1).values
+        near_enough = known & (difference < OWN_DIFFERENCE)
+        keep = near_enough.view(-1, 1, 1, 1) & (own.error <= OWN_ERROR * fitted.error)
+        self.own_scale = keep.float()
+        self.affine = self._affine_start = self.affine.or_else(affine, keep.flatten())
+        self.match_weight = torch.where(keep, self.match_weight, weight)
+        if self.certainty is not None and certainty is not None:
+            self.certainty = torch.where(keep, self.certainty, certainty)
+        pairs = zip(own, fitted, strict=True)
+        return MeasuredError(*(torch.where(keep, of_own, of_fitted) for of_own, of_fitted in pairs))
+
+    def _measured_target(self, x: Tensor) -> Matches:
+        """Return the matches and points that measure the error of an estimate ``x``."""
+        target = self._target(self.objective.metric_depth(x, self.affine))
         assert target is not None  # there are matches or points
-        target = target if self.maps.valid is None else target.within(self.maps.valid)
-        measured = measure_error(depth_m, target, self.objective.left_01, self.config)
+        return target if self.maps.valid is None else target.within(self.maps.valid)
+
+    def _measure_error(self, x: Tensor) -> MeasuredError:
+        """Measure the error of an estimate ``x``."""
+        depth_m = self.objective.metric_depth(x, self.affine)
+        return measure_error(depth_m, self._measured_target(x), self.objective.left_01, self.config)
+
+    def _regional_error(self, x: Tensor, measured: MeasuredError) -> Tensor:
+        """Return the prior's error, ``(B, 1, 1, 1)``, or ``(B, 1, H, W)`` for a given map and two views."""
         volumes = [evidence.volume for evidence in self.evidence if evidence.volume is not None]
         if not self.maps.given or self.matches is None or len(volumes) < len(self.evidence):
             return measured.error
-        return regional_error(measured, target, volumes)
+        return regional_error(measured, self._measured_target(x), volumes)
 
     def _weight_by_reflections(self, matches: Matches, depth_m: Tensor) -> Tensor:
         """Return the factor ``(B, 1, H, W)`` on the confidence of matches that removes reflections."""
@@ -265,7 +314,7 @@ class Trajectory:
         error = local_error(self.error, self.maps.valid)
         if target is None or error is None:
             return x
-        fit = fit_depth(depth_m, target, self.objective.left_01, error, self.config)
+        fit = fit_depth(depth_m, target, self.objective.left_01, error, self.config, self.own_scale)
         # Resample the factor: a resampled difference of maps would be wrong on both sides of an edge.
         change = F.interpolate(fit.log_change, x.shape[-2:], mode="bilinear", antialias=True)
         return self.metric.relative(self.metric(x, self.affine) * torch.exp(-change), self.affine)
@@ -299,6 +348,7 @@ class Trajectory:
         measured = {
             "match_weight": self.match_weight,
             "certainty": self.certainty,
+            "own_scale": self.own_scale,
             "error": self.error,
             "valid": self.maps.valid,
             "rank_correlation": self.rank_correlation,

@@ -21,6 +21,7 @@ from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 from geodiff_plugin.priors.transformers_depth import range_of
+from geodiff_plugin.scale.space import SPACES
 
 #: Layout of ``load_prior("map")``, which needs no folder.
 MAP_LAYOUT = Layout(Path(__file__).with_suffix(""), "map")
@@ -100,26 +101,41 @@ class DepthMapPipeline(DirectMapPipeline):
         if len(maps) != len(image):
             bad_value("depth_map", f"one map (h, w) for each of {len(image)} images", f"{len(maps)}")
         size = image_size(image)
-        prepared = []
-        for values, view in zip(maps, image.float().split(1), strict=True):
+        prepared, ranges = [], []
+        for (values, low), view in zip(maps, image.float().split(1), strict=True):
             sides = values.shape[-1] / values.shape[-2], size[1] / size[0]
             if math.log(sides[0]) * math.log(sides[1]) < MIN_LOG_PRODUCT:
                 got = "{1}x{0} pixels".format(*values.shape[-2:])
                 bad_value(
                     "depth_map", f"{size[1]}x{size[0]} pixels, like the image", got, "Is it transposed?"
                 )
-            filled, known = _filled(values.to(view.device))
+            filled, known, span = _filled(values.to(view.device))
+            ranges.append(_metres(self.space, low, low + float(span)))
             inside = F.interpolate(known.float(), size, mode="bilinear", antialias=True) > ALL_KNOWN
             prepared.append((_resized(filled, view / 2 + 0.5), inside))
         relative, known = (
             torch.cat(part).repeat_interleave(ensemble_size, dim=0) for part in zip(*prepared, strict=True)
         )
         self.valid = None if bool(known.all()) else known
+        has_metres = any(near > 0 for near, _ in ranges)
+        ends_m = relative.new_tensor(ranges).repeat_interleave(ensemble_size, dim=0)
+        self.metric_range = ends_m if has_metres else None
         return {"image_latent": relative}
 
 
-def _as_list(given: Any) -> list[Tensor]:
-    """Convert ``depth_map`` to maps ``(1, 1, h, w)`` float32 starting at 0, NaN where unknown."""
+def _metres(space: str, low: float, high: float) -> tuple[float, float]:
+    """Return the depths of a map's values at its ends, if it is in metres; NaN if it cannot be."""
+    if low <= 0.0:
+        return math.nan, math.nan
+    depths_m = SPACES[space].forward(torch.tensor([low, high], dtype=torch.float64), torch.ones(1))
+    return float(depths_m[0]), float(depths_m[1])
+
+
+def _as_list(given: Any) -> list[tuple[Tensor, float]]:
+    """Convert ``depth_map`` to maps ``(1, 1, h, w)`` float32 starting at 0, and their minima before that.
+
+    They are NaN where unknown.
+    """
     if given is None:
         hint = "Use pipe(left, depth_map=array, guidance=...), or --prior-map FILE."
         bad_value("depth_map", "passed to the prior 'map'", "nothing", hint)
@@ -131,8 +147,8 @@ def _as_list(given: Any) -> list[Tensor]:
     return [_from_zero(each) for each in given]
 
 
-def _from_zero(given: np.ndarray | Tensor) -> Tensor:
-    """Subtract the minimum of one map, ``(1, 1, h, w)`` float32, NaN where unknown."""
+def _from_zero(given: np.ndarray | Tensor) -> tuple[Tensor, float]:
+    """Subtract the minimum of one map, and return both; ``(1, 1, h, w)`` float32, NaN where unknown."""
     values = torch.as_tensor(np.ascontiguousarray(given) if isinstance(given, np.ndarray) else given)
     if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():
         bad_value("depth_map", "a map (h, w) of 2 x 2 pixels or more", f"shape {tuple(values.shape)}")
@@ -144,22 +160,27 @@ def _from_zero(given: np.ndarray | Tensor) -> Tensor:
         hint = "Non-finite values mean unknown; a map needs at least two different depths."
         bad_value("depth_map", "a map with two different finite values", "none", hint)
     low = values[inside].min()  # before float32, which would round a small range far from 0
-    return torch.where(inside, values - low, values.new_tensor(torch.nan)).float()[None, None]
+    from_zero = torch.where(inside, values - low, values.new_tensor(torch.nan)).float()[None, None]
+    return from_zero, float(low)
 
 
-def _filled(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale a map's minimum to 0 and its 98 % quantile to 1, fill holes, and return where it is known."""
+def _filled(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Scale a map's minimum to 0 and its 98 % quantile to 1, and fill its holes.
+
+    Returns the map, where it is known, and the difference ``(1,)`` of quantile and minimum.
+    """
     known = values.isfinite()
     low, high = range_of(values[known][None, None, None])
     if high <= low:  # nearly all of it is flat
         high = values[known].max()[None]
-    values = torch.where(known, (values - low) / (high - low), torch.zeros_like(values))
+    span = high - low
+    values = torch.where(known, (values - low) / span, torch.zeros_like(values))
     if bool(known.all()):
-        return values, known
+        return values, known, span
     weight = KNOWN_WEIGHT * known.float()
     affinities = torch.ones_like(values)
     system = FieldSystem(weight, weight * values, affinities[..., 1:], affinities[..., 1:, :])
-    return torch.where(known, values, solve_field(system, FILL_STEPS)), known
+    return torch.where(known, values, solve_field(system, FILL_STEPS)), known, span
 
 
 def _resized(values: Tensor, left_01: Tensor) -> Tensor:

@@ -102,7 +102,8 @@ class DepthPrior:
         takes_prompt: whether the call takes ``prompt_depth``, depths that the network starts from.
         takes_map: whether the call takes ``depth_map``, the user's map, which is the result without guidance.
         depth_channels: depth channels of the scheduler's latents; guidance does not change the others.
-        metric_range: for a metric prior, ``(N * E, 2)`` metres at 0 and at 1 of its maps; else ``None``.
+        metric_range: for a metric prior, ``(N * E, 2)`` metres at 0 and at 1 of its maps; else ``None``. With
+            ``takes_map``, metres if the user's maps are in metres.
         valid: ``(N * E, 1, H, W)`` bool, pixels of the processing grid with a prior depth; ``None`` for all.
     """
 
@@ -127,7 +128,9 @@ class DepthPrior:
         if self.metric_range is not None:  # nearest first, which is at x = 1 in disparity
             depth_range = DepthRange(*self.metric_range[samples].T.sort(0).values)
         valid = None if self.valid is None else self.valid[samples]
-        return PriorMaps(self.space, valid, depth_range, self.takes_map)
+        if self.takes_map:
+            return PriorMaps(self.space, valid, given=True, own_range=depth_range)
+        return PriorMaps(self.space, valid, depth_range)
 
     @property
     def network_input(self) -> slice | None:

@@ -295,7 +295,8 @@ def refine(
         return None
     occlusions = None if matches is None else _half_occlusions_on(evidence, target.size)
     completed = target if occlusions is None else with_occluded(target, occlusions)
-    fit = fit_depth(sharp_m, completed, evidence.native.left.image_01[None], error, config)
+    own_scale = _mean(members, "own_scale")
+    fit = fit_depth(sharp_m, completed, evidence.native.left.image_01[None], error, config, own_scale)
     if matches is None:
         return Refined(fit.depth_m, fit.support, features_of(depth_m, fit.depth_m, completed, fit.support))
     # Selected again, because the fit has moved the edges next to which matches are left out.

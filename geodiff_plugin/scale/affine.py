@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, Self
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -26,6 +27,19 @@ class AffineState:
         """Return the state of some samples."""
         units = None if self.units is None else (self.units[0][samples], self.units[1][samples])
         return type(self)(self.s_hat[samples], self.t_hat[samples], self.g_s[samples], units)
+
+    def or_else(self, other: Self, use: Tensor) -> Self:
+        """Return this state for the samples to ``use (B,)`` bool, and the other's for the rest."""
+        units = None
+        if self.units is not None and other.units is not None:
+            scale_units, shift_units = zip(self.units, other.units, strict=True)
+            units = torch.where(use, *scale_units), torch.where(use, *shift_units)
+        return type(self)(
+            torch.where(use, self.s_hat, other.s_hat),
+            torch.where(use, self.t_hat, other.t_hat),
+            torch.where(use, self.g_s, other.g_s),
+            units,
+        )
 
     @property
     def scale(self) -> Tensor:

@@ -84,6 +84,7 @@ class PriorMaps:
     valid: Tensor | None = None  # (B, 1, h, w) bool, where the maps are defined; ``None``: everywhere
     depth_range: DepthRange | None = None  # of a metric prior
     given: bool = False  # whether the maps are the user's, and the same at every step
+    own_range: DepthRange | None = None  # of given maps if they are in metres; NaN if they cannot be
 
 
 @dataclass(frozen=True)

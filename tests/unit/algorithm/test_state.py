@@ -261,17 +261,60 @@ def test_the_scale_of_a_given_map_is_refined_without_reflections():
 @pytest.mark.parametrize("given", [True, False])
 def test_only_a_given_map_has_an_error_per_pixel(monkeypatch, given):
     trajectory = run(valid=False, given=given)
-    depth_m = trajectory.objective.metric_depth(trajectory.x, trajectory.affine)
     of_all, trajectory.error = trajectory.error, None
     assert of_all.shape == (4, 1, 1, 1)  # there is no volume
     trajectory.evidence = [replace(each, volume=str(b)) for b, each in enumerate(trajectory.evidence)]
     monkeypatch.setattr(state, "regional_error", lambda measured, target, volumes: (measured, volumes))
-    error = trajectory._measure_error(depth_m)
+    error = trajectory._regional_error(trajectory.x, trajectory._measure_error(trajectory.x))
     if given:
         measured, volumes = error
         assert volumes == list("0123") and measured.deviation.shape == (4, 1, *GRID)
         error = measured.error
     torch.testing.assert_close(error, of_all)
+
+
+def own_scale_of(true_m, off, wrong=0.0, seed=0):
+    """Trajectories of given maps in metres of a plane, all depths ``off``, and with a smooth error.
+
+    Matches and points are 2 % too far, with noise. Returns the one without and the one with the ends in metres.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    inverse = (1 + 0.01 * torch.randn(1, *GRID, generator=rng)) / (1.02 * true_m[0])
+    matches = Matches(inverse, torch.full_like(inverse, 0.95), 0.03 / true_m.mean())
+    own_m = true_m * off * torch.exp(wrong * (2 * smooth(1, 1, *GRID, seed=9) - 1))
+    low, high = own_m.min(), own_m.max()
+    at = (torch.rand(1, *GRID, generator=rng) > 0.95).float()
+    points = Matches(at * inverse, at, 0.03 / true_m.mean())  # without views, they find the scale
+    evidence = replace(evidence_of(0), matches=matches, reliable=reliable_matches(matches), points=points)
+    found = []
+    for ends in (None, DepthRange(low[None], high[None])):
+        maps = PriorMaps("depth", None, given=True, own_range=ends)
+        trajectory = Trajectory(CONFIG, [evidence], [0], maps, 0.1)
+        trajectory.x = (own_m - low) / (high - low)
+        trajectory.prepare(trajectory.x, Z0[:1])
+        found.append(trajectory)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("off", "wrong", "kept"),
+    [(1.0, 0.0, True), (1.0, 0.01, True), (1.25, 0.0, False), (0.8, 0.01, False), (100.0, 0.0, False)],
+)
+def test_a_given_map_in_metres_keeps_a_scale_that_fits_the_matches(off, wrong, kept):
+    true_m = 2.0 + torch.linspace(0, 3, GRID[1]).expand(1, 1, *GRID)
+    fitted, own = own_scale_of(true_m, off, wrong)
+    assert fitted.own_scale is None and own.own_scale.flatten().tolist() == [float(kept)]
+    found = [t.objective.metric_depth(t.x, t.affine) / true_m for t in (fitted, own)]
+    assert float(found[0].median()) == pytest.approx(1.02, abs=0.01), "the fit follows the matches"
+    if kept:
+        assert float(found[1].median()) == pytest.approx(off, abs=0.01)
+        results = [t.metric(t.fitted(t.x), t.affine) / true_m for t in (fitted, own)]
+        errors = [float((result.log() - math.log(off)).abs().mean()) for result in results]
+        assert errors[1] < 0.7 * errors[0], "matches with a common error do not move an accurate map as far"
+    else:
+        torch.testing.assert_close(found[1], found[0])
+        torch.testing.assert_close(own.error, fitted.error)
+        torch.testing.assert_close(own.match_weight, fitted.match_weight)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from geodiff_plugin.priors import map as module
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPipeline
+from geodiff_plugin.scale.space import MetricMap
 
 SIZE = (24, 36)
 
@@ -71,7 +72,7 @@ def test_a_filled_hole_is_the_mean_of_its_neighbours(pipe):
     """Laplace's equation between the known pixels around a hole."""
     values = make_map(0, (16, 16))
     values[6:9, 5:10] = np.nan
-    filled, known = module._filled(torch.from_numpy(values).float()[None, None])
+    filled, known, _ = module._filled(torch.from_numpy(values).float()[None, None])
     assert torch.equal(known[0, 0], torch.from_numpy(np.isfinite(values)))
     x, wanted = filled[0, 0].double().numpy(), unit(values)
     hole = ~np.isfinite(values)
@@ -87,7 +88,8 @@ def test_a_filled_hole_is_the_mean_of_its_neighbours(pipe):
 def test_a_map_that_is_nearly_all_flat_reaches_its_greatest_value():
     values = torch.full((1, 1, 20, 20), 2.0)
     values[0, 0, 3, 4], values[0, 0, 7, 7] = 7.0, 4.0
-    filled, _ = module._filled(values)
+    filled, _, span = module._filled(values)
+    assert span == 5.0
     assert (filled.min(), filled[0, 0, 3, 4], filled[0, 0, 7, 7]) == (0.0, 1.0, pytest.approx(0.4))
 
 
@@ -153,7 +155,39 @@ def test_a_small_range_far_from_0_survives_in_double_precision(pipe):
     values = 1e7 + 1e-3 * make_map()
     np.testing.assert_allclose(condition(pipe, values)[0, 0], unit(values), atol=1e-3)
     assert condition(pipe, np.asfortranarray(values[:, ::-1])[:, ::-1]).isfinite().all()
-    assert module._from_zero(make_map()[:2, :2]).shape == (1, 1, 2, 2)
+    corner, lowest = module._from_zero(make_map()[:2, :2])
+    assert corner.shape == (1, 1, 2, 2) and lowest == make_map()[:2, :2].min()
+
+
+@pytest.mark.parametrize("space", ["depth", "disparity"])
+@pytest.mark.parametrize("step", [1, 2])
+def test_the_ends_of_a_map_in_metres_are_known(space, step):
+    """A map at another size has the same ends; a hole has none."""
+    pipe = load_prior("map", space=space)
+    depth_m = np.linspace(2.0, 6.0, SIZE[0] * SIZE[1]).reshape(SIZE)[::step, ::step].copy()
+    given = depth_m if space == "depth" else 1 / depth_m
+    given[0, 3] = np.nan
+    condition(pipe, given)
+    maps = pipe.maps_of(slice(None))
+    x = condition(pipe, given)
+    metric = MetricMap(space)
+    found = metric(torch.as_tensor(x), metric.from_range(*maps.own_range[:2]))
+    known = np.isfinite(given)
+    if step == 1:
+        np.testing.assert_allclose(found[0, 0].numpy()[known], depth_m[known], rtol=2e-3)
+    assert maps.given and maps.depth_range is None
+    nearest, farthest = (float(end) for end in maps.own_range[:2])
+    assert nearest == pytest.approx(2.0 if space == "depth" else np.quantile(depth_m[known], 0.02), rel=0.02)
+    assert farthest == pytest.approx(np.quantile(depth_m[known], 0.98) if space == "depth" else 6.0, rel=0.03)
+
+
+def test_a_map_with_values_below_0_is_not_in_metres(pipe):
+    below, above = make_map() - 6, make_map()
+    condition(pipe, below)
+    assert pipe.maps_of(slice(None)).own_range is None
+    pipe.prepare_condition(torch.zeros(2, 3, *SIZE), 2, 1, None, [below, above])
+    near_m = pipe.maps_of(slice(None)).own_range.near_m
+    assert near_m.isnan().tolist() == [True, True, False, False]
 
 
 @pytest.mark.parametrize("factor", [0.4, 1.4, 1.5, 2.0])
