@@ -30,7 +30,7 @@ MIN_TIKHONOV = 5e-4
 #: Maximum Tikhonov weight; a larger one would reduce the change at the matches themselves.
 MAX_TIKHONOV = 0.03
 #: Tikhonov weight of a map with its own scale, relative to a match with the same error. It is below 1,
-#: because the errors of neighbouring matches are similar, as are those of the map.
+#: because neighbouring matches have similar errors, and so has the map in neighbouring pixels.
 OWN_DEPTH_WEIGHT = 0.2
 #: Number of passes of a fit. Smoothness falls geometrically from a broad value to the one for the prior's
 #: error.

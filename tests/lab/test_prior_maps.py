@@ -32,12 +32,9 @@ WORSE = {
     ("kitti2015/000000", "smooth1"): BETTER,
     ("kitti2015/000000", "PSMNet"): BETTER,
     ("middlebury2014/Adirondack-perfect", "PSMNet"): UNSEEN,
-    ("synthetic/seed0002", "smooth1"): BETTER,
     ("synthetic/seed0002", "smooth10"): UNSEEN,
     ("synthetic/seed0002", "smooth15"): UNSEEN,
     ("synthetic/seed0002", "patches"): UNSEEN,
-    ("synthetic/seed0003", "smooth1"): BETTER,
-    ("synthetic/seed0003", "smooth5"): UNSEEN,
 }
 
 

@@ -276,7 +276,7 @@ def test_only_a_given_map_has_an_error_per_pixel(monkeypatch, given):
 def own_scale_of(true_m, off, wrong=0.0, seed=0):
     """Trajectories of given maps in metres of a plane, all depths ``off``, and with a smooth error.
 
-    Matches and points are 2 % too far, with noise. Returns the one without and the one with the ends in metres.
+    Matches and points are 2 % too far, with noise. The first trajectory does not know the ends in metres.
     """
     rng = torch.Generator().manual_seed(seed)
     inverse = (1 + 0.01 * torch.randn(1, *GRID, generator=rng)) / (1.02 * true_m[0])
