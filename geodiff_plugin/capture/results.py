@@ -272,7 +272,7 @@ def write_results(
         write_splats(
             out / "nerfstudio", capture, names, lambda name: _splat_frame(load(name)), cloud, original
         )
-    ends = _common_range(out, names)
+    ends = common_range([out / name for name in names])
     _sheet(capture, out, names, doubted, ends)
     _video(capture, out, names, ends)
     return {"cloud_points": len(cloud.points_m)}
@@ -313,16 +313,20 @@ def _splat_frame(frame: DepthFrame) -> SplatFrame:
     return SplatFrame(frame, kept(frame))
 
 
-def _common_range(out: Path, names: Sequence[str]) -> tuple[float, float]:
-    """Return the depths at the ends of the colours of all frames, by their measured depths."""
+def common_range(folders: Sequence[Path]) -> tuple[float, float]:
+    """Return the depths at the ends of the colours of several results, by their measured depths.
+
+    Args:
+        folders: results, with ``depth.npy``, a report, and ``confidence.npy`` unless the preset has none.
+    """
     depths, measured_depths = [], []
-    for name in names:
-        depth, confidence = (
-            np.load(out / name / f"{file}.npy", mmap_mode="r")[::RANGE_EVERY, ::RANGE_EVERY]
-            for file in ("depth", "confidence")
-        )
-        depths.append(depth.reshape(1, -1))
-        measured_depths.append(measured(depths[-1], confidence.reshape(1, -1) > 0, _measurable(out / name)))
+    for folder in folders:
+        depth = np.load(folder / "depth.npy", mmap_mode="r")[::RANGE_EVERY, ::RANGE_EVERY].reshape(1, -1)
+        valid = depth > 0
+        if (path := folder / "confidence.npy").is_file():
+            valid &= np.load(path, mmap_mode="r")[::RANGE_EVERY, ::RANGE_EVERY].reshape(1, -1) > 0
+        depths.append(depth)
+        measured_depths.append(measured(depth, valid, _measurable(folder)))
     return plotting.measured_range(np.hstack(measured_depths), np.hstack(depths))
 
 
@@ -477,9 +481,11 @@ def write_workspace(
     """Write a dense COLMAP workspace: images, sparse model, depth (where kept) and normal maps.
 
     ``points (M, 3)`` are points of the solve, ``seen`` the indices per frame; COLMAP chooses pairs by shared
-    points.
+    points. The same depth is in ``depth/`` as float32 TIFF, 0 where unknown, for splatting with Brush.
+    Source: pull request 497 of ArthurBrussee/brush, which reads ``depth/<stem of the image>.tiff``.
     """
-    for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
+    of_stereo = ("depth_maps", "normal_maps", "consistency_graphs")
+    for name in ("images", "depth", "sparse", *(f"stereo/{each}" for each in of_stereo)):
         (folder / name).mkdir(parents=True, exist_ok=True)
     views = []
     maps = folder / "stereo"
@@ -490,6 +496,7 @@ def write_workspace(
         u, v = np.rint(px).astype(int).T.clip(0, np.array(rgb.size)[:, None] - 1)
         colours[rows] = np.asarray(rgb)[v, u]
         depth = np.where(kept(frame), frame.depth, 0)[..., None]
+        Image.fromarray(depth[..., 0].astype(np.float32)).save(folder / "depth" / f"{frame.name}.tiff")
         file = f"{frame.name}.png.geometric.bin"
         write_map(maps / "depth_maps" / file, depth)
         write_map(maps / "normal_maps" / file, normals_of(frame.depth, frame.camera))

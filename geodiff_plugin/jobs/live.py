@@ -26,9 +26,10 @@ from geodiff_plugin.jobs.notices import Notify, silent
 from geodiff_plugin.jobs.options import AUTO, LiveOptions
 from geodiff_plugin.jobs.prior import prior_of_options
 from geodiff_plugin.jobs.reading import read_pair
-from geodiff_plugin.jobs.report import depth_summary, single_map
+from geodiff_plugin.jobs.report import depth_summary, measurable_limit, single_map
 from geodiff_plugin.jobs.writing import thresholds
 from geodiff_plugin.plotting import as_rgb_image
+from geodiff_plugin.result.readings import measured
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.streaming.loop import LiveFrame, live
 from geodiff_plugin.streaming.rig import RigSetup, Setup
@@ -53,6 +54,12 @@ class LiveResult:
     frame: LiveFrame
     depth_m: np.ndarray
     row: dict[str, Any]
+
+    @property
+    def measured_m(self) -> np.ndarray:
+        """The depth, 0 where it is too far to be measured, unless all of it is."""
+        near_enough = measured(self.depth_m, self.depth_m > 0, measurable_limit(self.frame.output))
+        return near_enough if near_enough.any() else self.depth_m
 
 
 def live_results(

@@ -12,6 +12,7 @@ import numpy as np
 
 from geodiff_plugin import formats, plotting
 from geodiff_plugin._internal.checks import bad_value, raise_input_error
+from geodiff_plugin.capture.results import common_range
 from geodiff_plugin.formats import (
     REPORT,
     check_new_file,
@@ -55,8 +56,9 @@ def write_video(
         frames: folders of ``geodiff depth``, or ``.npy`` maps ``(H, W)`` in metres, all of the same size.
         out: ``.mp4``, ``.webp`` or ``.gif``.
         fps: frames per second.
-        near: depth of the last colour, metres (default: from the maps).
-        far: depth of the first colour (default: from the maps).
+        near: depth of the last colour, metres (default: from the maps, of folders without depths that are too
+            far to be measured).
+        far: depth of the first colour (default: likewise).
         overwrite: whether to replace an existing file.
     """
     plotting.check_video(out, fps)
@@ -68,6 +70,8 @@ def write_video(
         if size != sizes[0]:
             both = f"{sizes[0]} in {frames[0]}, {size} in {path}"
             raise_input_error(f"The frames have different sizes: {both}. Make a separate video per size.")
+    if near is None and far is None and all(map(os.path.isdir, frames)):
+        near, far = common_range(frames)
     metric = all(read_report(file.parent).get("unit", "m") is not None for file in files)
     images = plotting.depth_frames(depths_m, near=near, far=far, unit="m" if metric else None)
     plotting.write_depth_video(out, images, fps)

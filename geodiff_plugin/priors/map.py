@@ -127,7 +127,7 @@ def _metres(space: str, low: float, high: float) -> tuple[float, float]:
     """Return the depths of a map's values at its ends, if it is in metres; NaN if it cannot be."""
     if low <= 0.0:
         return math.nan, math.nan
-    depths_m = SPACES[space].forward(torch.tensor([low, high], dtype=torch.float64), torch.ones(1))
+    depths_m = SPACES[space].forward(torch.tensor([low, high], dtype=torch.float32), torch.ones(1))
     return float(depths_m[0]), float(depths_m[1])
 
 

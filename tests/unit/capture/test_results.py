@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -248,6 +249,18 @@ def test_cameras_of_a_workspace_are_read_by_colmap(workspace):
         np.testing.assert_allclose(camera.params, [*K_true.diagonal()[:2], *K_true[:2, 2] + 0.5], rtol=1e-7)
         pose = found.cam_from_world() if callable(found.cam_from_world) else found.cam_from_world
         np.testing.assert_allclose(pose.matrix(), np.linalg.inv(E)[:3], atol=1e-9)
+
+
+def test_depth_for_brush_is_float32_of_the_size_of_the_image(workspace):
+    frames, *_, folder = workspace
+    for frame in frames:
+        stored = cv2.imread(str(folder / f"depth/{frame.name}.tiff"), cv2.IMREAD_UNCHANGED)
+        assert stored.dtype == np.float32
+        expected = np.where(results.kept(frame), frame.depth, 0).astype(np.float32)
+        np.testing.assert_array_equal(stored, expected)
+        assert 0 < (stored > 0).mean() < 1
+        with Image.open(folder / f"images/{frame.name}.png") as image:
+            assert image.size == stored.shape[::-1]
 
 
 def test_points_that_two_frames_of_a_workspace_see_have_their_tracks_and_colours(workspace):
@@ -752,7 +765,7 @@ def test_colours_of_all_frames_end_at_the_farthest_measured_depth(finished, plai
         depth[20:24], confidence[20:24] = 20.0 + number + 0.5, 0.9
         results.save_alone(out / name, depth, confidence, np.full_like(depth, 0.1))
     results.write_agreement(finished, out, NAMES)
-    near, far = results._common_range(out, NAMES)
+    near, far = results.common_range([out / name for name in NAMES])
     measured = []
     for number, name in enumerate(NAMES):
         depth, confidence, *_ = (each[::8, ::8] for each in maps_of(out, name))
@@ -761,7 +774,7 @@ def test_colours_of_all_frames_end_at_the_farthest_measured_depth(finished, plai
     np.testing.assert_allclose((near, far), np.percentile(np.concatenate(measured), (2, 98)))
     for name in NAMES:  # by an earlier version
         (out / name / "report.json").write_text("{}")
-    assert results._common_range(out, NAMES)[1] > 400
+    assert results.common_range([out / name for name in NAMES])[1] > 400
 
 
 def test_the_colours_of_a_frame_end_at_its_farthest_measured_depth(finished, tmp_path, monkeypatch):

@@ -155,3 +155,22 @@ def test_what_is_no_depth_map_is_no_frame(tmp_path, values):
     np.save(tmp_path / "map.npy", values)
     with pytest.raises(InputError, match="FRAME must be a depth map"):
         write_video([tmp_path / "map.npy"], tmp_path / "v.gif", 4.0)
+
+
+def test_a_sky_and_invalid_pixels_do_not_stretch_the_colours_of_a_video(tmp_path, monkeypatch):
+    ends = []
+    monkeypatch.setattr(
+        results.plotting, "depth_frames", lambda *_, near, far, unit: ends.append((near, far)) or iter(())
+    )
+    monkeypatch.setattr(results.plotting, "write_depth_video", lambda *_: None)
+    folders = [tmp_path / name for name in ("a", "b")]
+    for number, folder in enumerate(folders):
+        folder.mkdir()
+        depth, confidence = np.full((80, 96), 2.0 + number, np.float32), np.ones((80, 96), np.float32)
+        depth[:24] = 500.0  # sky
+        depth[40:64], confidence[40:64] = 0.1, 0.0
+        np.save(folder / "depth.npy", depth)
+        np.save(folder / "confidence.npy", confidence)
+        (folder / "report.json").write_text(json.dumps({"unit": "m", "measurable_m": 50.0}))
+    write_video(folders, tmp_path / "v.gif", 4.0)
+    assert ends[0] == pytest.approx((2.0, 3.0), rel=0.01)
