@@ -43,9 +43,11 @@ from geodiff_plugin.types import StepReport
 
 #: Number of times that the scale of a given map is refined without reflections: each finds further ones.
 REFITS = 2
-#: Maximum error of given maps with their own scale, relative to their error with the fitted one, and maximum
-#: median difference of both in log depth, with which their own scale is kept.
-OWN_ERROR, OWN_DIFFERENCE = 1.1, 0.07
+#: Maximum error of a given map with its own scale, relative to its error with the fitted one, with which it
+#: keeps its own scale.
+OWN_ERROR = 1.1
+#: Maximum median difference of both maps in log depth with which it does.
+OWN_DIFFERENCE = 0.07
 
 
 def _samples_of_images(image_of_sample: Sequence[int]) -> list[slice]:
@@ -267,23 +269,24 @@ class Trajectory:
         pairs = zip(own, fitted, strict=True)
         return MeasuredError(*(torch.where(keep, of_own, of_fitted) for of_own, of_fitted in pairs))
 
-    def _measured_target(self, x: Tensor) -> Matches:
-        """Return the matches and points that measure the error of an estimate ``x``."""
-        target = self._target(self.objective.metric_depth(x, self.affine))
+    def _measured_target(self, depth_m: Tensor) -> Matches:
+        """Return the matches and points that measure the error of an estimate."""
+        target = self._target(depth_m)
         assert target is not None  # there are matches or points
         return target if self.maps.valid is None else target.within(self.maps.valid)
 
     def _measure_error(self, x: Tensor) -> MeasuredError:
         """Measure the error of an estimate ``x``."""
         depth_m = self.objective.metric_depth(x, self.affine)
-        return measure_error(depth_m, self._measured_target(x), self.objective.left_01, self.config)
+        return measure_error(depth_m, self._measured_target(depth_m), self.objective.left_01, self.config)
 
     def _regional_error(self, x: Tensor, measured: MeasuredError) -> Tensor:
         """Return the prior's error, ``(B, 1, 1, 1)``, or ``(B, 1, H, W)`` for a given map and two views."""
         volumes = [evidence.volume for evidence in self.evidence if evidence.volume is not None]
         if not self.maps.given or self.matches is None or len(volumes) < len(self.evidence):
             return measured.error
-        return regional_error(measured, self._measured_target(x), volumes)
+        target = self._measured_target(self.objective.metric_depth(x, self.affine))
+        return regional_error(measured, target, volumes)
 
     def _weight_by_reflections(self, matches: Matches, depth_m: Tensor) -> Tensor:
         """Return the factor ``(B, 1, H, W)`` on the confidence of matches that removes reflections."""

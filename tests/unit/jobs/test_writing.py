@@ -305,7 +305,7 @@ def test_depth_in_another_camera_is_that_of_the_same_points(tmp_path):
     np.testing.assert_array_equal(millimetres, np.rint(seen_m.astype(float) * 1000))
     sigma_m = np.load(tmp_path / "sigma_reprojected.npy")
     assert sigma_m.dtype == np.float32 and (np.isfinite(sigma_m) == (seen_m > 0)).all()
-    # The camera is 5 cm behind, so a point's depth is larger in it by more than that of the left camera.
+    # The camera is 5 cm behind, so points are farther from it than from the left camera.
     relative = sigma_m[seen_m > 0] / seen_m[seen_m > 0]
     assert relative.min() > 0.019 and relative.max() < 0.02
     sigma_mm = np.asarray(Image.open(tmp_path / "sigma_reprojected_mm.png"))
