@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import dataclass, fields
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -174,9 +175,12 @@ def _file_note(path: str | None, camera_input: str, camera: str, name: str) -> s
     return "".join(notes)
 
 
-def _known_image(left: str | None, camera_input: str, scale_input: str) -> str:
-    """Return the left image on which the ends of the known length are tapped; empty if not needed."""
-    if left is None or camera_input != "images" or scale_input != "known":
+def _known_image(left: str | None) -> str:
+    """Return the left image, on which the ends of a known length are tapped; empty without an image.
+
+    It does not depend on which fields are shown: answers to two quick changes may arrive in either order.
+    """
+    if left is None:
         return ""
     try:
         image_size(left, "the left image")
@@ -204,13 +208,14 @@ def _views() -> dict[str, Any]:
         elem_id="camera-input",
     )
     groups = _camera_fields(drawn)
+    # First, because the page handles one answer to an event after another, and these come without a request.
+    sources = [drawn[name] for name in ("camera_input", "camera", "scale_input")]
+    show = _show_groups(list(groups))
+    gr.on([field.change for field in sources], None, sources, list(groups.values()), js=show, queue=False)
     for name, label in (("left", "the left image"), ("right", "the right image")):
         inputs = [drawn[name], drawn["camera_input"], drawn["camera"]]
         note = partial(_file_note, name=label)
         gr.on([field.change for field in inputs], note, inputs, notes[name], **IN_ORDER)
-    sources = [drawn[name] for name in ("camera_input", "camera", "scale_input")]
-    groups_shown = partial(_visible, list(groups))
-    gr.on([field.change for field in sources], groups_shown, sources, list(groups.values()), **IN_ORDER)
     return drawn
 
 
@@ -260,7 +265,17 @@ def _camera_fields(drawn: dict[str, Any]) -> dict[str, Any]:
     return groups
 
 
-def _visible(groups: list[str], camera_input: str, camera: str, scale_input: str) -> list[Any]:
+def _show_groups(groups: list[str]) -> str:
+    """Return a script that shows the groups of fields that a source of the cameras, focal and scale need.
+
+    The browser looks them up: the form changes at once, and no answer to an earlier change can arrive last.
+    """
+    sources = product(CAMERA_INPUTS, FOCAL_INPUTS, SCALE_INPUTS)
+    updates = {",".join(source): _shown(groups, *source) for source in sources}
+    return templates.show_groups(updates, list(FOCAL_INPUTS))
+
+
+def _shown(groups: list[str], camera_input: str, camera: str, scale_input: str) -> list[Any]:
     """Return which groups of fields appear, and the distance's placeholder."""
     by_images = camera_input == "images"
     shown = {
@@ -289,8 +304,7 @@ def _length_fields(drawn: dict[str, Any]) -> None:
     drawn["ends"] = gr.Textbox(
         label="Its two ends, px", placeholder="tap them above", max_lines=1, elem_id="ends"
     )
-    inputs = [drawn[name] for name in ("left", "camera_input", "scale_input")]
-    gr.on([field.change for field in inputs], _known_image, inputs, image, **IN_ORDER)
+    drawn["left"].change(_known_image, drawn["left"], image, **IN_ORDER)
     drawn["left"].change(lambda: "", outputs=drawn["ends"], **QUICK)
 
 

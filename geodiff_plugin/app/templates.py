@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import html
+import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from geodiff_plugin.app.messages import Message, on_page
@@ -98,6 +100,17 @@ VIEWER = """
   </div>
 </div>
 """
+
+
+def show_groups(updates: dict[str, list[Any]], focal_inputs: list[str]) -> str:
+    """Return a script that looks up ``updates`` by the chosen sources of cameras, focal length and scale.
+
+    A lens, which is not one of ``focal_inputs``, needs the same fields as the first of these.
+    """
+    return (
+        f"(cameras, focal, scale) => {{ const focals = {json.dumps(focal_inputs)}; "
+        f"return {json.dumps(updates)}[[cameras, focals.includes(focal) ? focal : focals[0], scale]]; }}"
+    )
 
 
 def scale_note(rel_std: float) -> str:

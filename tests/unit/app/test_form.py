@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -238,20 +239,32 @@ def test_at_first_the_fields_of_a_calibration_file_are_seen(drawn):
         (("images", "fx", "known"), {"camera", "lens", "scale", "length"}),
     ],
 )
-def test_a_source_shows_the_fields_that_it_needs_with_fitting_placeholders(given, seen, drawn, monkeypatch):
-    fields = [drawn.form.fields[name] for name in ("camera_input", "camera", "scale_input")]
-    handler = next(f for f in handlers(drawn, fields[2], "change") if len(f.outputs) > 1)
-    assert handler.trigger_mode == "multiple" and handler.concurrency_limit == 1
-    assert [i._id for i in handler.inputs] == [field._id for field in fields]
-    assert {(field._id, "change") for field in fields} == set(handler.targets)
-    groups = handler.fn.args[0]
-    updates = dict(zip(groups, handler.fn(*given), strict=True))
+def test_a_source_shows_the_fields_that_it_needs_with_fitting_placeholders(given, seen, monkeypatch):
+    from geodiff_plugin.app.form import _shown
+
+    groups = "calib formats poselib camera fov lens cx_right scale baseline error guess length".split()
+    updates = dict(zip(groups, _shown(groups, *given), strict=True))
     assert {name for name, update in updates.items() if update["visible"]} == seen
     placeholders = {"file": "from the file", "numbers": "required", "images": "such as 12 cm"}
     assert updates["baseline"]["placeholder"] == placeholders[given[0]]
     monkeypatch.setattr("geodiff_plugin.app.form.can_estimate", lambda: False)
-    updates = dict(zip(groups, handler.fn(*given), strict=True))
+    updates = dict(zip(groups, _shown(groups, *given), strict=True))
     assert updates["poselib"]["visible"] == (given[0] == "images"), "a missing package is reported at once"
+
+
+def test_the_browser_shows_the_fields_of_a_source_without_a_request(drawn):
+    from geodiff_plugin.app.form import _shown
+
+    fields = [drawn.form.fields[name] for name in ("camera_input", "camera", "scale_input")]
+    handler = handlers(drawn, fields[2], "change")[0]
+    assert not handler.fn and [i._id for i in handler.inputs] == [field._id for field in fields]
+    assert {(field._id, "change") for field in fields} == set(handler.targets)
+    assert handlers(drawn, fields[0], "change")[0] is handler, "before others, whose answers it would await"
+    updates, _ = json.JSONDecoder().raw_decode(handler.js, handler.js.index('{"images,'))
+    assert len(updates) == 3 * 3 * 3
+    one = _shown(["fov", "baseline"], "images", "fov", "guess")
+    shown = dict(zip((output._id for output in handler.outputs), updates["images,fov,guess"], strict=True))
+    assert [shown[drawn.form.fields[name]._id] for name in ("fov", "baseline")] == one
 
 
 def test_a_dropped_file_is_described_by_its_size_or_its_error(drawn, pair, tmp_path, monkeypatch):
@@ -286,17 +299,13 @@ def test_a_dropped_file_is_described_by_its_size_or_its_error(drawn, pair, tmp_p
 
 def test_the_left_image_is_shown_for_taps_on_the_ends_of_a_known_length(drawn, pair):
     fields = drawn.form.fields
-    of_field = handlers(drawn, fields["scale_input"], "change")
+    of_field = handlers(drawn, fields["left"], "change")
     (handler,) = [f for f in of_field if [each.elem_id for each in f.outputs] == ["known-image"]]
-    html = handler.fn(pair["left"], "images", "known")
+    assert handler.targets == [(fields["left"]._id, "change")], "answers of two fields could change places"
+    assert handler.trigger_mode == "multiple" and handler.concurrency_limit == 1
+    html = handler.fn(pair["left"])
     assert 'data-picked="ends" data-width="64" data-height="48"' in html and "data:image/jpeg" in html
-    for left, way, scale in (
-        (None, "images", "known"),
-        (pair["left"], "file", "known"),
-        (pair["left"], "images", "guess"),
-        (__file__, "images", "known"),
-    ):
-        assert handler.fn(left, way, scale) == ""
+    assert handler.fn(None) == handler.fn(__file__) == ""
     (clear,) = [f for f in handlers(drawn, fields["left"], "change") if not f.inputs]
     assert clear.fn() == "" and [output._id for output in clear.outputs] == [fields["ends"]._id]
 
