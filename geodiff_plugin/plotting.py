@@ -109,10 +109,14 @@ class SmoothedRange:
     def __init__(self) -> None:
         self._range: np.ndarray | None = None
 
-    def update(self, depth_m: np.ndarray) -> tuple[float | None, float | None]:
-        """Include the depth of the next frame; return near and far, ``None`` before any depth is known."""
+    def update(self, measured_m: np.ndarray, depth_m: np.ndarray) -> tuple[float | None, float | None]:
+        """Include the depth of the next frame, as in ``measured_range``.
+
+        Returns:
+            Nearest and farthest depth, ``None`` before any depth is known.
+        """
         if (depth_m > 0).any():
-            current = np.array(depth_range(depth_m))
+            current = np.array(measured_range(measured_m, depth_m))
             kept = current if self._range is None else self._range
             self._range = KEPT_RANGE * kept + (1 - KEPT_RANGE) * current
         return (None, None) if self._range is None else (float(self._range[0]), float(self._range[1]))

@@ -262,7 +262,7 @@ class Trajectory:
         near_enough = known & (difference < OWN_DIFFERENCE)
         keep = near_enough.view(-1, 1, 1, 1) & (own.error <= OWN_ERROR * fitted.error)
         self.own_scale = keep.float()
-        self.affine = self._affine_start = self.affine.or_else(affine, keep.flatten())
+        self.affine = self._affine_start = self.affine.where(keep.flatten(), affine)
         self.match_weight = torch.where(keep, self.match_weight, weight)
         if self.certainty is not None and certainty is not None:
             self.certainty = torch.where(keep, self.certainty, certainty)

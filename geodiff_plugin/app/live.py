@@ -47,7 +47,7 @@ class LiveView:
 
     def put(self, result: LiveResult, line: str) -> None:
         """Replace the newest result; ``line`` describes it."""
-        self._newest = _Newest(result, *self._range.update(result.measured_m), line)
+        self._newest = _Newest(result, *self._range.update(result.measured_m, result.depth_m), line)
 
     def drawn(self) -> Drawn:
         """Return the newest result as HTML."""

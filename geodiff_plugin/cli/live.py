@@ -126,7 +126,7 @@ class _Window(AbstractContextManager["_Window"]):
 
     def show(self, result: LiveResult) -> bool:
         """Show a result; ``False`` if the user closed the window."""
-        near, far = self._range.update(result.measured_m)
+        near, far = self._range.update(result.measured_m, result.depth_m)
         shown = np.hstack(
             [np.asarray(as_rgb_image(result.frame.left)), colour_depth(result.depth_m, near, far)]
         )

@@ -57,9 +57,8 @@ class LiveResult:
 
     @property
     def measured_m(self) -> np.ndarray:
-        """The depth, 0 where it is too far to be measured, unless all of it is."""
-        near_enough = measured(self.depth_m, self.depth_m > 0, measurable_limit(self.frame.output))
-        return near_enough if near_enough.any() else self.depth_m
+        """The depth, 0 where it is too far to be measured."""
+        return measured(self.depth_m, self.depth_m > 0, measurable_limit(self.frame.output))
 
 
 def live_results(

@@ -28,7 +28,7 @@ class AffineState:
         units = None if self.units is None else (self.units[0][samples], self.units[1][samples])
         return type(self)(self.s_hat[samples], self.t_hat[samples], self.g_s[samples], units)
 
-    def or_else(self, other: Self, use: Tensor) -> Self:
+    def where(self, use: Tensor, other: Self) -> Self:
         """Return this state for the samples to ``use (B,)`` bool, and the other's for the rest."""
         units = None
         if self.units is not None and other.units is not None:

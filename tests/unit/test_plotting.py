@@ -177,12 +177,16 @@ def test_the_ends_of_the_colours_leave_two_per_cent_on_either_side():
 
 def test_the_colours_of_a_video_keep_nine_tenths_of_their_range():
     colours = plotting.SmoothedRange()
-    assert colours.update(np.zeros((4, 5))) == (None, None)
+    unknown = np.zeros((20, 20))
+    assert colours.update(unknown, unknown) == (None, None)
     depth_m = np.linspace(1.0, 3.0, 400).reshape(20, 20)
-    first = colours.update(depth_m)
-    assert first == pytest.approx(depth_range(depth_m))
-    assert colours.update(np.zeros((4, 5))) == first, "a frame without depth changes nothing"
-    assert colours.update(2 * depth_m) == pytest.approx([1.1 * each for each in first])
+    sky_m = np.where(np.arange(20) < 5, 80.0, depth_m)
+    first = colours.update(np.where(sky_m < 80, sky_m, 0), sky_m)
+    assert first == pytest.approx(depth_range(depth_m[:, 5:])), "the sky is not measured"
+    assert colours.update(unknown, unknown) == first, "a frame without depth changes nothing"
+    assert colours.update(unknown, 2 * depth_m) == pytest.approx(
+        0.9 * np.array(first) + 0.1 * np.array(depth_range(2 * depth_m))
+    ), "all of it, if nothing was measured"
 
 
 def test_the_ends_of_a_large_map_are_those_of_a_sample_of_its_known_pixels(monkeypatch):
