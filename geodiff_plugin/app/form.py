@@ -155,8 +155,11 @@ def image_field(label: str, name: str) -> gr.Image:
     return image
 
 
-def _file_note(path: str | None, camera_input: str, camera: str, name: str) -> str:
-    """Return HTML with the size of a dropped image and what is missing in it, or its error."""
+def _file_note(path: str | None, name: str) -> str:
+    """Return HTML with the size of a dropped image and what is missing in it, or its error.
+
+    It does not depend on other fields: the answers to two quick changes may arrive in either order.
+    """
     if path is None:
         return ""
     try:
@@ -166,7 +169,7 @@ def _file_note(path: str | None, camera_input: str, camera: str, name: str) -> s
     is_heic = Path(path).suffix.lower() in (".heic", ".heif")
     hidden = "; browsers cannot display HEIC" if is_heic else ""
     notes = [f'<div class="note">{width} x {height} pixels{hidden}</div>']
-    if camera_input == "images" and camera == "exif" and not states_focal_length(path):
+    if not states_focal_length(path):
         missing = Message(
             "The file does not state its focal length.",
             "Choose your camera or field of view under Focal length.",
@@ -178,7 +181,7 @@ def _file_note(path: str | None, camera_input: str, camera: str, name: str) -> s
 def _known_image(left: str | None) -> str:
     """Return the left image, on which the ends of a known length are tapped; empty without an image.
 
-    It does not depend on which fields are shown: answers to two quick changes may arrive in either order.
+    Like the note of a file, it does not depend on other fields.
     """
     if left is None:
         return ""
@@ -208,14 +211,11 @@ def _views() -> dict[str, Any]:
         elem_id="camera-input",
     )
     groups = _camera_fields(drawn)
-    # First, because the page handles one answer to an event after another, and these come without a request.
     sources = [drawn[name] for name in ("camera_input", "camera", "scale_input")]
     show = _show_groups(list(groups))
     gr.on([field.change for field in sources], None, sources, list(groups.values()), js=show, queue=False)
     for name, label in (("left", "the left image"), ("right", "the right image")):
-        inputs = [drawn[name], drawn["camera_input"], drawn["camera"]]
-        note = partial(_file_note, name=label)
-        gr.on([field.change for field in inputs], note, inputs, notes[name], **IN_ORDER)
+        drawn[name].change(partial(_file_note, name=label), drawn[name], notes[name], **IN_ORDER)
     return drawn
 
 
@@ -266,7 +266,7 @@ def _camera_fields(drawn: dict[str, Any]) -> dict[str, Any]:
 
 
 def _show_groups(groups: list[str]) -> str:
-    """Return a script that shows the groups of fields that a source of the cameras, focal and scale need.
+    """Return a script that shows what a source of the cameras, focal length and scale needs.
 
     The browser looks them up: the form changes at once, and no answer to an earlier change can arrive last.
     """

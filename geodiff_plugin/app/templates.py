@@ -105,10 +105,12 @@ VIEWER = """
 def show_groups(updates: dict[str, list[Any]], focal_inputs: list[str]) -> str:
     """Return a script that looks up ``updates`` by the chosen sources of cameras, focal length and scale.
 
-    A lens, which is not one of ``focal_inputs``, needs the same fields as the first of these.
+    A lens, which is not one of ``focal_inputs``, needs the same fields as the first of these. The style sheet
+    shows what an image file lacks if the form uses it.
     """
     return (
         f"(cameras, focal, scale) => {{ const focals = {json.dumps(focal_inputs)}; "
+        "document.getElementById('form').dataset.focal = cameras === 'images' ? focal : ''; "
         f"return {json.dumps(updates)}[[cameras, focals.includes(focal) ? focal : focals[0], scale]]; }}"
     )
 
@@ -205,7 +207,10 @@ def note(message: Message) -> str:
 
 
 def needs_camera(message: Message) -> str:
-    """Return an error below an image without a focal length; it also highlights the field of the camera."""
+    """Return an error below an image without a focal length; it also highlights the field of the camera.
+
+    It is shown while the focal length is to be read from the file.
+    """
     return f'<div class="needs-camera">{note(message)}</div>'
 
 

@@ -291,8 +291,9 @@ def test_a_phone_begins_with_the_images_alone_and_asks_for_what_they_lack(visito
         page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
         page.wait_for_selector(f"#{name}-note >> text=Choose your camera")
     choose(page, "camera", "Enter the field of view")
+    page.locator("#left-note .needs-camera").wait_for(state="hidden")
+    assert "608 x 460 pixels" in page.locator("#left-note").inner_text()
     field(page, "fov").fill("60")
-    page.wait_for_selector("#left-note >> text=608 x 460 pixels")
     page.get_by_label("Only a rough distance").click()
     page.locator("#guess input").wait_for()
     page.click("#run")
@@ -314,6 +315,8 @@ def test_a_phone_begins_with_the_images_alone_and_asks_for_what_they_lack(visito
 def test_a_camera_of_the_list_and_a_known_length_are_named_and_drawn(visitor, pair_without_exif):
     page = visitor()
     upload(page, pair_without_exif)
+    page.locator("#left-note .needs-camera").wait_for(state="attached")
+    assert page.locator("#left-note .needs-camera").is_hidden(), "a calibration file states it"
     page.get_by_label("Estimate from the images").click()
     page.wait_for_selector("#left-note >> text=Choose your camera")
     choose(page, "camera", "Camera with 28 mm")
