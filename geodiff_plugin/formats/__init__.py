@@ -127,6 +127,7 @@ if TYPE_CHECKING:  # public names; imported on first use at run time, because so
     from geodiff_plugin.formats.rigs import intrinsics as intrinsics
     from geodiff_plugin.formats.rigs import is_distorted as is_distorted
     from geodiff_plugin.formats.rigs import rig_from_parameters as rig_from_parameters
+    from geodiff_plugin.formats.rigs import with_baseline as with_baseline
     from geodiff_plugin.formats.synchronization import Offset as Offset
     from geodiff_plugin.formats.synchronization import estimate_offset as estimate_offset
     from geodiff_plugin.formats.synchronization import frame_interval as frame_interval

@@ -11,12 +11,12 @@ from typing import NoReturn
 
 import numpy as np
 
-from geodiff_plugin._internal.checks import UnknownFormatError, bad_type, bad_value, check_number, warn
+from geodiff_plugin._internal.checks import UnknownFormatError, bad_type, bad_value, warn
 from geodiff_plugin.findings import Finding
 from geodiff_plugin.formats import colmap, spatial, storage
 from geodiff_plugin.formats.calibrations import CALIBRATION_FORMATS
 from geodiff_plugin.formats.files import PathLike
-from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, in_units, reading_file
+from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_file, with_baseline
 from geodiff_plugin.formats.unread import raise_unread_calibration
 from geodiff_plugin.types import Rig
 
@@ -95,12 +95,7 @@ def _in_metres(rig: Rig, baseline_m: float | None, by_image: bool) -> Rig:
         sentence = f"{rig.source} has no unit, so depth is in the model's unit. {hint}"
         warn(Finding("calibration.no-unit", sentence), stacklevel=3)
         return replace(rig, unit=None, measured=False)
-    check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
-    length = float(np.linalg.norm(rig.E[:3, 3]))
-    if length == 0:
-        hint = "Both its cameras have the same position."
-        bad_value("baseline_m", f"omitted for {rig.source}", baseline_m, hint)
-    return in_units(rig, length / baseline_m)
+    return with_baseline(rig, baseline_m)
 
 
 def read_calibration(

@@ -23,6 +23,7 @@ from geodiff_plugin._internal.checks import (
     InputFileError,
     bad_value,
     check_baseline_m,
+    check_number,
     check_positive,
     raise_input_error,
 )
@@ -356,6 +357,16 @@ def in_units(rig: Rig, units: float) -> Rig:
     E = rig.E.copy()
     E[:3, 3] /= units
     return replace(rig, E=E, as_taken=None if rig.as_taken is None else in_units(rig.as_taken, units))
+
+
+def with_baseline(rig: Rig, baseline_m: float) -> Rig:
+    """Scale a rig to the measured distance between its cameras, in metres."""
+    check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
+    length = float(np.linalg.norm(rig.E[:3, 3]))
+    if length == 0:
+        hint = "Both its cameras have the same position."
+        bad_value("baseline_m", f"omitted for {rig.source}", baseline_m, hint)
+    return replace(in_units(rig, length / baseline_m), measured=True)
 
 
 def rectified_from(rig: Rig, left: RawCamera, right: RawCamera, turns: tuple[Any, Any]) -> Rig:

@@ -78,7 +78,7 @@ class Parameters(CameraSource):
 
 @dataclass(frozen=True, kw_only=True)
 class Matrices(CameraSource):
-    """``--K`` and ``--E``: files with a 3x3 and a 4x4 matrix."""
+    """``--K`` and ``--E``: files with a 3x3 and a 4x4 matrix; a measured baseline sets the length of E."""
 
     title = "matrices"
     intrinsics = ("k",)
@@ -89,6 +89,7 @@ class Matrices(CameraSource):
     k: Path
     e: Path | None
     k_right: Path | None
+    baseline: float | None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,7 @@ from geodiff_plugin.formats import (
     read_matrix,
     rig_from_parameters,
     warn_of_other_lens,
+    with_baseline,
 )
 from geodiff_plugin.jobs.camera_sources import CalibrationFile, FieldOfView, Matrices, Parameters
 from geodiff_plugin.jobs.options import DepthOptions
@@ -206,11 +207,15 @@ def _rig_of_parameters(given: Parameters, left_size: Size) -> Rig:
 
 
 def _rig_of_matrices(given: Matrices) -> Rig:
-    """Return the rig of ``--K``, ``--K-right`` and ``--E``; a left image alone has two equal cameras."""
+    """Return the rig of ``--K``, ``--K-right`` and ``--E``; a left image alone has two equal cameras.
+
+    Poses are usually estimated by a tracker; ``--baseline`` is the measured length of the translation of E.
+    """
     K = _read_K(given.k, "--K")
     K_right = K if given.k_right is None else _read_K(given.k_right, "--K-right")
     E = np.eye(4) if given.e is None else check_pose(read_matrix(given.e, "--E"), "--E")
-    return Rig(Camera(K), Camera(K_right), E, source=str(given.k), measured=given.e is None)
+    rig = Rig(Camera(K), Camera(K_right), E, source=str(given.k), measured=given.e is None)
+    return rig if given.e is None or given.baseline is None else with_baseline(rig, given.baseline)
 
 
 def _intrinsics_of_view(

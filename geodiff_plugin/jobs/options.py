@@ -132,7 +132,8 @@ class RigOptions(RunOptions):
     )
     baseline: float | None = _camera(
         None,
-        "Baseline in metres. Overrides the baseline in --calib.",
+        "Measured baseline in metres. Overrides the baseline in --calib, and the distance of the cameras in "
+        "--E.",
         own_check=check_baseline_m,
     )
     fx: float | None = _camera(None, "Focal length along x in pixels.")

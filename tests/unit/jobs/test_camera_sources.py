@@ -31,6 +31,10 @@ def parameters(**given) -> Parameters:
     return Parameters(**{**NO_NUMBERS, **given})
 
 
+def matrices(**given) -> Matrices:
+    return Matrices(**{**dict.fromkeys(("e", "k_right", "baseline")), **given})
+
+
 @pytest.mark.parametrize(
     ("given", "source"),
     [
@@ -38,22 +42,24 @@ def parameters(**given) -> Parameters:
         ({**PAIR, "calib": (FILE,), "cameras": "2,3"}, CalibrationFile(**OF_FILE | {"cameras": "2,3"})),
         ({**PAIR, "calib": (FILE,), "baseline": 0.1}, CalibrationFile(**OF_FILE | {"baseline": 0.1})),
         ({**POINTS, "calib": (FILE,)}, CalibrationFile(**OF_FILE)),
-        ({**PAIR, "k": FILE, "e": OTHER}, Matrices(k=FILE, e=OTHER, k_right=None)),
-        ({**PAIR, "k": FILE, "e": OTHER, "k_right": FILE}, Matrices(k=FILE, e=OTHER, k_right=FILE)),
+        ({**PAIR, "k": FILE, "e": OTHER}, matrices(k=FILE, e=OTHER)),
+        ({**PAIR, "k": FILE, "e": OTHER, "k_right": FILE}, matrices(k=FILE, e=OTHER, k_right=FILE)),
+        ({**PAIR, "k": FILE, "e": OTHER, "baseline": 0.1}, matrices(k=FILE, e=OTHER, baseline=0.1)),
         ({**PAIR, **CAMERA}, parameters(**CAMERA)),
         (
             {**PAIR, **CAMERA, "cx": 3.0, "cy": 2.0, "cropped": True, "cx_right": 4.0},
             parameters(**CAMERA, cx=3.0, cy=2.0, cx_right=4.0),
         ),
         ({**POINTS, "fx": 500.0}, parameters(fx=500.0)),
-        ({**POINTS, "k": FILE}, Matrices(k=FILE, e=None, k_right=None)),
+        ({**POINTS, "k": FILE}, matrices(k=FILE)),
         ({**DISPARITY, **CAMERA}, parameters(**CAMERA)),
+        ({**DISPARITY, "k": FILE, "e": OTHER, "baseline": 0.1}, matrices(k=FILE, e=OTHER, baseline=0.1)),
         (UNPOSED, Exif()),
         ({**UNPOSED, "baseline": 0.1}, Exif()),
         ({**UNPOSED, "fov": 60.0}, FieldOfView(fov=60.0)),
         ({**UNPOSED, "fov": 60.0, "baseline": 0.1}, FieldOfView(fov=60.0)),
-        ({**UNPOSED, "k": FILE}, Matrices(k=FILE, e=None, k_right=None)),
-        ({**UNPOSED, "k": FILE, "k_right": OTHER}, Matrices(k=FILE, e=None, k_right=OTHER)),
+        ({**UNPOSED, "k": FILE}, matrices(k=FILE)),
+        ({**UNPOSED, "k": FILE, "k_right": OTHER}, matrices(k=FILE, k_right=OTHER)),
         ({**UNPOSED, **CAMERA}, parameters(**CAMERA)),
         ({**UNPOSED, "cropped": True, "view": (FILE,), "view_k": (FILE,)}, Exif()),
     ],
@@ -99,11 +105,7 @@ def test_the_source_has_the_values_of_its_options(given, source):
             "The cameras are specified in several ways (parameters and matrices). Pass only one of: "
             "--calib FILE, or --fx, or --K.",
         ),
-        (
-            {**DISPARITY, "k": FILE, "e": FILE, "baseline": 0.1},
-            "The cameras are specified in several ways (parameters and matrices). Pass only one of: "
-            "--calib FILE, or --fx --baseline, or --K --E.",
-        ),
+        ({**PAIR, "k": FILE, "baseline": 0.1}, "--K --baseline needs --E as well."),
         (
             {**UNPOSED, "k": FILE, "fov": 60.0},
             "K is specified in several ways (matrices and --fov). Pass only one of: --fx, or --K, or --fov, "

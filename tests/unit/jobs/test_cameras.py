@@ -70,6 +70,22 @@ def test_matrices_are_checked_and_named_by_their_options(files, tmp_path):
         assert said in str(caught.value)
 
 
+def test_a_measured_baseline_is_the_length_of_e_and_keeps_its_direction(files, tmp_path):
+    E = np.eye(4)
+    E[:3, :3], E[:3, 3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], (0.3, 0.0, -0.4)
+    np.savetxt(tmp_path / "E.txt", E)
+    given = options(files, e=tmp_path / "E.txt")
+    estimated, measured = (read_rig(replace(given, baseline=length), SIZES[0]) for length in (None, 0.1))
+    np.testing.assert_allclose(estimated.E, E)
+    E[:3, 3] = (0.06, 0.0, -0.08)
+    np.testing.assert_allclose(measured.E, E)
+    assert not estimated.measured and measured.measured
+    E[:3, 3] = 0
+    np.savetxt(tmp_path / "E.txt", E)
+    with pytest.raises(InputError, match="Both its cameras have the same position"):
+        read_rig(replace(given, baseline=0.1), SIZES[0])
+
+
 @pytest.mark.filterwarnings("ignore:.*has no unit")
 def test_a_rig_is_read_for_images_that_have_other_names_in_its_calibration(files, tmp_path):
     """Of a model with three images: the pair is the one that is named."""
