@@ -14,6 +14,7 @@ the calibration has lens distortion, the left images are stored without it, as t
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -106,11 +107,37 @@ def create_copy(source: Any, features: dict[str, Any], options: argparse.Namespa
     )
 
 
+def problem_of(source: Any, options: argparse.Namespace) -> str | None:
+    """Return why depth cannot be added to a dataset, or ``None``."""
+    for option, key in (("--left", options.left), ("--right", options.right)):
+        if key not in source.features:
+            images = [k for k, each in source.features.items() if each["dtype"] in ("image", "video")]
+            return f"{option} {key} is not in the dataset; its images are {', '.join(images)}"
+    return f"the dataset already contains {DEPTH}" if DEPTH in source.features else None
+
+
 def add_depth(source: Any, pipe: Any, rig: Rig, options: argparse.Namespace) -> None:
-    """Copy a dataset with the depth of every frame, then compare the last depth with the stored one."""
+    """Copy a dataset with the depth of every frame; a copy that is not finished is deleted."""
     features = {
         k: each for k, each in source.features.items() if k not in ADDED and each["dtype"] != "language"
     }
+    try:
+        depth_m = copy_frames(source, features, pipe, rig, options)
+    except BaseException:
+        shutil.rmtree(options.out, ignore_errors=True)
+        raise
+    stored_m = channels_last(open_dataset(options.out)[len(source) - 1][DEPTH])
+    known = depth_m > 0
+    error_mm = 1000 * np.abs(stored_m - depth_m)[known].max(initial=0)
+    print(f"last frame: stored depth differs by at most {error_mm:.1f} mm")
+    if not known.all():
+        print(f"{np.mean(~known):.1%} of it are unknown, stored as {stored_m[~known].max():.2f} m")
+
+
+def copy_frames(
+    source: Any, features: dict[str, Any], pipe: Any, rig: Rig, options: argparse.Namespace
+) -> np.ndarray:
+    """Write all frames with their depth to a new dataset; return the last depth ``(H, W, 1)`` in metres."""
     dataset = create_copy(source, features, options)
     frames = stereo_frames(source, options.left, options.right)
     episode = 0
@@ -126,13 +153,7 @@ def add_depth(source: Any, pipe: Any, rig: Rig, options: argparse.Namespace) -> 
             print(f"{finding.severity.value}: {finding}")
     dataset.save_episode()
     dataset.finalize()
-
-    stored_m = channels_last(open_dataset(options.out)[result.number][DEPTH])
-    known = depth_m > 0
-    error_mm = 1000 * np.abs(stored_m - depth_m)[known].max(initial=0)
-    print(f"last frame: stored depth differs by at most {error_mm:.1f} mm")
-    if not known.all():
-        print(f"{np.mean(~known):.1%} of it are unknown, stored as {stored_m[~known].max():.2f} m")
+    return depth_m
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -144,7 +165,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--left", default="observation.images.left", help="feature with the left images")
     parser.add_argument("--right", default="observation.images.right", help="feature with the right images")
     parser.add_argument("--tiff", action="store_true", help="store depth as lossless TIFF, not as a video")
-    parser.add_argument("--max-depth", type=float, default=10.0, help="maximum depth of the video, metres")
+    parser.add_argument("--max-depth", type=float, default=10.0, help="maximum depth of depth videos, metres")
     parser.add_argument("--min-confidence", type=float, default=0.0, help="depth below is stored as unknown")
     parser.add_argument("--prior", default="bundled", help="'bundled', a Hugging Face model ID or a folder")
     parser.add_argument("--steps", type=int, default=None, help="denoising steps (default: from the prior)")
@@ -153,9 +174,13 @@ def main(argv: list[str] | None = None) -> None:
     if (options.source is None) != (options.calib is None):
         parser.error("expected a dataset and its calibration, or neither")
 
+    if options.out.exists():
+        parser.error(f"--out {options.out} exists; choose a new folder")
+    source = None if options.source is None else open_dataset(options.source)
+    if source is not None and (problem := problem_of(source, options)):
+        parser.error(problem)
     pipe = enable_geometry_guidance(load_prior(options.prior))
-    if options.source is not None:
-        source = open_dataset(options.source)
+    if source is not None:
         size = channels_last(source[0][options.left]).shape[1::-1]
         rig = read_calibration(options.calib, image_size=size, distorted=True)
         add_depth(source, pipe, rig, options)

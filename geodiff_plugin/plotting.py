@@ -94,13 +94,15 @@ def depth_range(depth_m: Any, near: float | None = None, far: float | None = Non
     return float(low), float(high)
 
 
-def measured_range(measured_m: Any, depth_m: Any) -> tuple[float, float]:
+def measured_range(
+    measured_m: Any, depth_m: Any, near: float | None = None, far: float | None = None
+) -> tuple[float, float]:
     """Return the ``depth_range`` of measured depths, or of all ``depth_m`` if none was measured.
 
     ``measured_m`` is ``depth_m`` with 0 where it is invalid or too far to be measured, as in the sky, which
     would leave few colours for the rest.
     """
-    return depth_range(measured_m if (measured_m > 0).any() else depth_m)
+    return depth_range(measured_m if (measured_m > 0).any() else depth_m, near, far)
 
 
 class SmoothedRange:

@@ -88,8 +88,8 @@ def _z_buffer(inverse: np.ndarray, camera: Camera, other: PosedCamera) -> tuple[
             cells, z = row * width + column, samples.z[inside]
             before = nearest[cells]
             keep_nearest(torch.from_numpy(nearest), torch.from_numpy(cells), torch.from_numpy(z))
-            wins = (z < before) & (z == nearest[cells])  # the first of equal depths, often the pixel itself
-            source[cells[wins]] = samples.source[inside][wins]
+            wins = np.flatnonzero((z < before) & (z == nearest[cells]))[::-1]
+            source[cells[wins]] = samples.source[inside][wins]  # the first of equal depths, written last
     return nearest, source
 
 

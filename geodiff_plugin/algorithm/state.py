@@ -46,7 +46,7 @@ REFITS = 2
 #: Maximum error of a given map with its own scale, relative to its error with the fitted one, with which it
 #: keeps its own scale.
 OWN_ERROR = 1.1
-#: Maximum median difference of both maps in log depth with which it does.
+#: Maximum median difference in log depth between both scales with which it keeps its own.
 OWN_DIFFERENCE = 0.07
 
 
@@ -153,8 +153,14 @@ class Trajectory:
         self._assess_matches(x)
 
     def find_scale(self, x: Tensor) -> None:
-        """Search g_s and the initial scale and shift of a relative map (S7.3), or refine the current ones."""
+        """Search g_s and the initial scale and shift of a relative map (S7.3), or refine the current ones.
+
+        A given map is the same at every step, and its first scale is better, because it is chosen with
+        weighted matches.
+        """
         is_first = self._affine_start is None
+        if self.maps.given and not is_first:
+            return
         if self.config.search == "volume":
             current = self.maps.depth_range
             if not is_first:
@@ -258,8 +264,7 @@ class Trajectory:
         self._weigh_matches(self.matches, x)
         own = self._measure_error(x)
         ratio = self.objective.metric_depth(x, self.affine) / fitted_m
-        difference = ratio.log().abs().flatten(1).median(1).values
-        near_enough = known & (difference < OWN_DIFFERENCE)
+        near_enough = known & (self._median_where_valid(ratio.log().abs()) < OWN_DIFFERENCE)
         keep = near_enough.view(-1, 1, 1, 1) & (own.error <= OWN_ERROR * fitted.error)
         self.own_scale = keep.float()
         self.affine = self._affine_start = self.affine.where(keep.flatten(), affine)
@@ -268,6 +273,13 @@ class Trajectory:
             self.certainty = torch.where(keep, self.certainty, certainty)
         pairs = zip(own, fitted, strict=True)
         return MeasuredError(*(torch.where(keep, of_own, of_fitted) for of_own, of_fitted in pairs))
+
+    def _median_where_valid(self, values: Tensor) -> Tensor:
+        """Return the median ``(B,)`` of ``(B, 1, H, W)`` at pixels with a prior depth, NaN without any."""
+        if self.maps.valid is None:
+            return values.flatten(1).median(1).values
+        inside = F.interpolate(self.maps.valid.float(), values.shape[-2:], mode="nearest-exact") > 0
+        return torch.stack([each[use].median() for each, use in zip(values, inside, strict=True)])
 
     def _measured_target(self, depth_m: Tensor) -> Matches:
         """Return the matches and points that measure the error of an estimate."""

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from geodiff_plugin import plotting
-from geodiff_plugin._internal.checks import InputFileError, warn
+from geodiff_plugin._internal.checks import InputError, InputFileError, bad_value, warn
 from geodiff_plugin.cameras import Camera, PosedCamera
 from geodiff_plugin.capture.agreement import agreed, scene_poses, temporally_smoothed
 from geodiff_plugin.capture.frames import Capture, choose_neighbours
@@ -26,6 +26,7 @@ from geodiff_plugin.formats import (
     files_of_report,
     flying_points,
     read_report,
+    reason_of,
     save_png,
     write_colmap,
     write_depth_mm,
@@ -54,7 +55,7 @@ ON_SHEET = 24
 GLB_POINTS = 400_000
 #: Size in pixels of the video, whose frames show an image and its depth side by side.
 VIDEO_SIZE = (1280, 480)
-#: Distance between the rows and columns whose pixels determine the colours of the video and the sheet.
+#: Distance between the rows and columns whose pixels determine the colours of videos and the sheet.
 RANGE_EVERY = 8
 #: Frames per second, slow enough to look at each.
 VIDEO_FPS = 5.0
@@ -85,13 +86,24 @@ def _frame(capture: Capture, out: Path, maps: Mapping[str, str], name: str) -> D
 
 def _loaded(folder: Path, maps: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Read maps of a frame by their fields of ``DepthFrame``."""
-    return {field: np.load(folder / f"{file}.npy") for file, field in maps.items()}
+    return {field: _read_map(folder / f"{file}.npy") for file, field in maps.items()}
+
+
+def _read_map(path: Path) -> np.ndarray:
+    """Read a map of a result; the error for a missing or damaged file names it."""
+    try:
+        values: np.ndarray = np.load(path)
+    except (OSError, ValueError, EOFError) as error:
+        hint = "Delete its folder and run the command that wrote it again."
+        reason = reason_of(error) if isinstance(error, OSError) else error
+        raise InputError(f"{path} cannot be read ({reason}). {hint}") from error
+    return values
 
 
 def _measurable(folder: Path) -> float | None:
     """Return the farthest depth that the views of a frame can measure, from its report."""
-    measurable: float | None = read_report(folder).get("measurable_m")
-    return measurable
+    measurable = read_report(folder).get("measurable_m")
+    return float(measurable) if isinstance(measurable, (int, float)) else None
 
 
 class Thresholds(NamedTuple):
@@ -220,8 +232,8 @@ def save_alone(
 
 def read_agreed(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read depth, confidence and sigma ``(H, W)`` of a frame after the agreement check."""
-    depth, confidence, sigma = (np.load(folder / f"{name}.npy") for name in ("depth", "confidence", "sigma"))
-    return depth, confidence, sigma
+    maps = _loaded(folder, {name: name for name in ("depth", "confidence", "sigma")})
+    return maps["depth"], maps["confidence"], maps["sigma"]
 
 
 def clear_frame(folder: Path) -> None:
@@ -313,21 +325,36 @@ def _splat_frame(frame: DepthFrame) -> SplatFrame:
     return SplatFrame(frame, kept(frame))
 
 
-def common_range(folders: Sequence[Path]) -> tuple[float, float]:
+def _sparse(values: np.ndarray) -> np.ndarray:
+    """Return the pixels of a map ``(H, W)`` that determine the colours of a video, ``(1, N)``."""
+    return values[::RANGE_EVERY, ::RANGE_EVERY].reshape(1, -1).copy()
+
+
+def common_range(
+    folders: Sequence[Path], near: float | None = None, far: float | None = None
+) -> tuple[float, float]:
     """Return the depths at the ends of the colours of several results, by their measured depths.
 
     Args:
         folders: results, with ``depth.npy``, a report, and ``confidence.npy`` unless the preset has none.
+        near: nearest depth, if it is given.
+        far: farthest depth, if it is given.
+
+    Raises:
+        InputError: a confidence map that cannot be read, or is not of the size of the depth map.
     """
     depths, measured_depths = [], []
     for folder in folders:
-        depth = np.load(folder / "depth.npy", mmap_mode="r")[::RANGE_EVERY, ::RANGE_EVERY].reshape(1, -1)
-        valid = depth > 0
+        depth = _read_map(folder / "depth.npy")
+        valid = _sparse(depth) > 0
         if (path := folder / "confidence.npy").is_file():
-            valid &= np.load(path, mmap_mode="r")[::RANGE_EVERY, ::RANGE_EVERY].reshape(1, -1) > 0
-        depths.append(depth)
-        measured_depths.append(measured(depth, valid, _measurable(folder)))
-    return plotting.measured_range(np.hstack(measured_depths), np.hstack(depths))
+            confidence = _read_map(path)
+            if confidence.shape != depth.shape:
+                bad_value(str(path), f"of shape {depth.shape}, like depth.npy", f"{confidence.shape}")
+            valid &= _sparse(confidence) > 0
+        depths.append(_sparse(depth))
+        measured_depths.append(measured(depths[-1], valid, _measurable(folder)))
+    return plotting.measured_range(np.hstack(measured_depths), np.hstack(depths), near, far)
 
 
 def _sheet(
@@ -495,10 +522,11 @@ def write_workspace(
         save_png(rgb, folder / "images" / f"{frame.name}.png")
         u, v = np.rint(px).astype(int).T.clip(0, np.array(rgb.size)[:, None] - 1)
         colours[rows] = np.asarray(rgb)[v, u]
-        depth = np.where(kept(frame), frame.depth, 0)[..., None]
-        Image.fromarray(depth[..., 0].astype(np.float32)).save(folder / "depth" / f"{frame.name}.tiff")
+        depth = np.where(kept(frame), frame.depth, 0).astype(np.float32)
+        with atomic_path(folder / "depth" / f"{frame.name}.tiff") as temporary:
+            Image.fromarray(depth).save(temporary)
         file = f"{frame.name}.png.geometric.bin"
-        write_map(maps / "depth_maps" / file, depth)
+        write_map(maps / "depth_maps" / file, depth[..., None])
         write_map(maps / "normal_maps" / file, normals_of(frame.depth, frame.camera))
         views.append((f"{frame.name}.png", frame.camera.K, frame.camera.E, rgb.size))
     rows, counts = np.unique(np.concatenate([each for _, each in seen]), return_counts=True)

@@ -96,20 +96,22 @@ def depth_summary(
     }
 
 
-def smoothed_entries(report: dict[str, Any], frame: DepthFrame) -> dict[str, Any]:
+def smoothed_entries(report: dict[str, Any], frame: DepthFrame, has_holes: bool) -> dict[str, Any]:
     """Return the entries of a frame's report that describe its maps after temporal smoothing.
 
     ``temporal_smoothing.alone`` keeps the entries of the frame's own result, also if smoothing is repeated.
+    Maps with removed depths have no mean confidence, because the confidence of those is removed as well.
     """
     names = ("depth", "sigma_median_m")
     alone = report.get("temporal_smoothing", {}).get("alone") or {name: report[name] for name in names}
     known = frame.depth > 0
+    confidence_mean = None if has_holes or not known.any() else float(frame.confidence[known].mean())
     depth = depth_summary(frame.depth, None, frame.confidence > 0, frame.measurable)
     entries = {
         "depth": depth | {"visible_fraction": alone["depth"]["visible_fraction"]},
         "sigma_median_m": median_sigma(frame.sigma),
         "temporal_smoothing": {
-            "confidence_mean": float(frame.confidence[known].mean()) if known.any() else 0.0,
+            "confidence_mean": confidence_mean,
             "alone": alone,
         },
     }

@@ -56,8 +56,8 @@ def write_video(
         frames: folders of ``geodiff depth``, or ``.npy`` maps ``(H, W)`` in metres, all of the same size.
         out: ``.mp4``, ``.webp`` or ``.gif``.
         fps: frames per second.
-        near: depth of the last colour, metres (default: from the maps, of folders without depths that are too
-            far to be measured).
+        near: depth of the last colour, metres (default: from the maps; in folders, depths too far to be
+            measured do not count).
         far: depth of the first colour (default: likewise).
         overwrite: whether to replace an existing file.
     """
@@ -70,8 +70,8 @@ def write_video(
         if size != sizes[0]:
             both = f"{sizes[0]} in {frames[0]}, {size} in {path}"
             raise_input_error(f"The frames have different sizes: {both}. Make a separate video per size.")
-    if near is None and far is None and all(map(os.path.isdir, frames)):
-        near, far = common_range(frames)
+    if all(map(os.path.isdir, frames)):
+        near, far = common_range(frames, near, far)
     metric = all(read_report(file.parent).get("unit", "m") is not None for file in files)
     images = plotting.depth_frames(depths_m, near=near, far=far, unit="m" if metric else None)
     plotting.write_depth_video(out, images, fps)

@@ -95,7 +95,8 @@ def write_smoothed_frames(
                 scenes.append(scene)
     except OSError as error:
         raise InputError(
-            f"--temporal-smoothing failed ({reason_of(error)}). Run the same command again to resume."
+            f"--temporal-smoothing failed for {error.filename or options.out} ({reason_of(error)}). Run the "
+            "same command again to resume."
         ) from error
     begins = [ref.name for k, ref in enumerate(refs) if k and scenes[k] != scenes[k - 1]]
     if begins:
@@ -114,7 +115,7 @@ def _update(result: _Result, scene: int, maps: DepthFrame, left: np.ndarray, opt
     """Write the files of a frame that depend on its smoothed maps, then its report."""
     frame, report = result.frame, result.report
     written = [*_npy(AGREED), *FIGURES, *PREVIEWS]
-    entries = smoothed_entries(report, maps)
+    entries = smoothed_entries(report, maps, options.holes)
     report["files"] |= write_previews(frame, maps, left, thresholds(options))
     if options.reproject is not None:
         depth_m, target = maps.depth * (maps.confidence > 0), options.target_camera()

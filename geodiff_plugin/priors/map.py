@@ -124,11 +124,10 @@ class DepthMapPipeline(DirectMapPipeline):
 
 
 def _metres(space: str, low: float, high: float) -> tuple[float, float]:
-    """Return the depths of a map's values at its ends, if it is in metres; NaN if it cannot be."""
-    if low <= 0.0:
-        return math.nan, math.nan
-    depths_m = SPACES[space].forward(torch.tensor([low, high], dtype=torch.float32), torch.ones(1))
-    return float(depths_m[0]), float(depths_m[1])
+    """Return the depths of a map's lowest and highest value, if it is in metres; NaN if it cannot be."""
+    ends_m = SPACES[space].forward(torch.tensor([low, high], dtype=torch.float32), torch.ones(1))
+    can_be_metres = (low > 0.0 or space == "log") and bool(((ends_m > 0) & ends_m.isfinite()).all())
+    return (float(ends_m[0]), float(ends_m[1])) if can_be_metres else (math.nan, math.nan)
 
 
 def _as_list(given: Any) -> list[tuple[Tensor, float]]:
@@ -148,7 +147,7 @@ def _as_list(given: Any) -> list[tuple[Tensor, float]]:
 
 
 def _from_zero(given: np.ndarray | Tensor) -> tuple[Tensor, float]:
-    """Subtract the minimum of one map, and return both; ``(1, 1, h, w)`` float32, NaN where unknown."""
+    """Return a map minus its minimum, ``(1, 1, h, w)`` float32, NaN where unknown, and the minimum."""
     values = torch.as_tensor(np.ascontiguousarray(given) if isinstance(given, np.ndarray) else given)
     if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():
         bad_value("depth_map", "a map (h, w) of 2 x 2 pixels or more", f"shape {tuple(values.shape)}")

@@ -261,7 +261,7 @@ def _measurable_m(evidence: Evidence, like: Tensor) -> Tensor | None:
 
 
 def _mean(members: Sequence[Member], name: str) -> Tensor | None:
-    """Average a measurement of the members, ``(1, 1, h, w)``; ``None`` if none has it."""
+    """Average a measurement of the members, ``(1, 1, h, w)`` of any size; ``None`` if none has it."""
     values = [value for member in members if (value := getattr(member, name)) is not None]
     if len(values) > 1:
         return torch.cat(values).float().mean(0, keepdim=True)

@@ -234,10 +234,26 @@ def test_depth_is_added_to_a_lerobot_dataset(run, prior):
         np.testing.assert_allclose(clipped[known], 0.5, atol=1e-5)
 
 
-def test_lerobot_example_needs_a_calibration(run, prior, capsys):
-    with pytest.raises(SystemExit):
-        run("lerobot_depth", "recorded", "--prior", prior)
-    assert "expected a dataset and its calibration" in capsys.readouterr().err
+@pytest.mark.usefixtures("lerobot")
+def test_lerobot_example_reports_what_it_cannot_use_and_leaves_nothing(run, prior, capsys, monkeypatch):
+    image = np.zeros((8, 12, 3), np.uint8)
+    lerobot_depth.record(Path("recorded"), [1], image, image)
+    calibrated = "recorded", "--calib", DEMO_PAIR_FOLDER / "calib.txt"
+    for words, said in (
+        (["recorded"], "expected a dataset and its calibration"),
+        ([*calibrated, "--out", "recorded"], "--out recorded exists"),
+        (
+            [*calibrated, "--right", "r"],
+            "--right r is not in the dataset; its images are observation.images.left",
+        ),
+    ):
+        with pytest.raises(SystemExit):
+            run("lerobot_depth", *words, "--prior", prior)
+        assert said in capsys.readouterr().err
+    monkeypatch.setattr(lerobot_depth, "live", lambda *_, **__: iter([None]))
+    with pytest.raises(AttributeError):
+        run("lerobot_depth", "--prior", prior, "--out", "copy")
+    assert not Path("copy").exists()
 
 
 def test_poses_of_networks_are_a_capture(run, tmp_path):

@@ -322,6 +322,18 @@ def test_sigma_is_multiplied_by_the_change_of_depth_along_the_other_z_axis():
     np.testing.assert_allclose(found[seen > 0], 0.1, rtol=1e-6)
 
 
+def test_of_equal_depths_the_sigma_is_the_first_ones():
+    """Of a wall, several pixels are in one of a camera of half the resolution."""
+    sigma = np.arange(1.0, 65.0).reshape(8, 8)
+    K_half = np.array([[20.0, 0, 2], [0, 20, 2], [0, 0, 1]])
+    K_full = np.array([[40.0, 0, 4], [0, 40, 4], [0, 0, 1]])
+    camera = target(K_half, np.eye(4), (4, 4))
+    depth, found = maps_in_camera(np.full((8, 8), 2.0), sigma, Camera(K_full), camera)
+    np.testing.assert_allclose(depth, 2.0)
+    firsts = [2, 3, 6]  # columns and rows 3, 4 and 5 are rounded to 2
+    np.testing.assert_allclose(found[1:, 1:], sigma[np.ix_(firsts, firsts)])
+
+
 def test_an_unknown_sigma_and_pixels_without_depth_have_none():
     depth = np.full((40, 60), 2.0)
     sigma = np.full((40, 60), 0.1)

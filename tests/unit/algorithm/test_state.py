@@ -315,6 +315,24 @@ def test_a_given_map_in_metres_keeps_a_scale_that_fits_the_matches(off, wrong, k
         torch.testing.assert_close(found[1], found[0])
         torch.testing.assert_close(own.error, fitted.error)
         torch.testing.assert_close(own.match_weight, fitted.match_weight)
+    for trajectory in (fitted, own):  # the next step of the same map
+        before = trajectory.affine
+        trajectory.prepare(trajectory.x, Z0[:1])
+        assert trajectory.affine is before
+
+
+def test_only_pixels_of_a_given_map_count_in_a_median():
+    """The rest is extrapolated; a map may be coarser, and without any pixel the median is unknown."""
+    valid = torch.zeros(3, 1, 2, 4, dtype=torch.bool)
+    valid[0, ..., :1], valid[1, ..., 2:] = True, True
+    maps = PriorMaps("depth", None, given=True)
+    trajectory = Trajectory(CONFIG, [evidence_of(0)] * 3, [0, 1, 2], maps, 0.1)
+    values = torch.arange(8.0).repeat(3, 1, 4, 1)
+    trajectory.maps = replace(maps, valid=valid)
+    found = trajectory._median_where_valid(values)
+    assert found[:2].tolist() == [0.0, 5.0] and found[2].isnan()
+    trajectory.maps = replace(maps, valid=None)
+    assert trajectory._median_where_valid(values).tolist() == [3.0] * 3
 
 
 @pytest.mark.parametrize(

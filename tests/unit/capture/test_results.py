@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import Capture, plotting
-from geodiff_plugin._internal.checks import InputFileError
+from geodiff_plugin._internal.checks import InputError, InputFileError
 from geodiff_plugin.cameras import Camera
 from geodiff_plugin.capture import results
 from geodiff_plugin.capture.agreement import agreed
@@ -772,9 +772,18 @@ def test_colours_of_all_frames_end_at_the_farthest_measured_depth(finished, plai
         measured.append(depth[(confidence > 0) & (depth < 20.0 + number)])
     assert far < 10 and (np.load(out / "d/depth.npy") > 400).mean() > 0.3
     np.testing.assert_allclose((near, far), np.percentile(np.concatenate(measured), (2, 98)))
-    for name in NAMES:  # by an earlier version
-        (out / name / "report.json").write_text("{}")
-    assert results.common_range([out / name for name in NAMES])[1] > 400
+    assert results.common_range([out / name for name in NAMES], near=0.5) == (0.5, far)
+    for report in ("{}", '{"measurable_m": "far"}'):  # by an earlier version, or by another program
+        for name in NAMES:
+            (out / name / "report.json").write_text(report)
+        assert results.common_range([out / name for name in NAMES])[1] > 400
+    path = out / NAMES[1] / "confidence.npy"
+    np.save(path, np.ones((3, 4), np.float32))
+    with pytest.raises(InputError, match=r"confidence.npy must be of shape .* like depth.npy; got \(3, 4\)"):
+        results.common_range([out / name for name in NAMES])
+    path.write_bytes(path.read_bytes()[:-4])
+    with pytest.raises(InputError, match=r"confidence.npy cannot be read \(.*\). Delete its folder"):
+        results.common_range([out / name for name in NAMES])
 
 
 def test_the_colours_of_a_frame_end_at_its_farthest_measured_depth(finished, tmp_path, monkeypatch):

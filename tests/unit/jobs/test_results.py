@@ -174,3 +174,6 @@ def test_a_sky_and_invalid_pixels_do_not_stretch_the_colours_of_a_video(tmp_path
         (folder / "report.json").write_text(json.dumps({"unit": "m", "measurable_m": 50.0}))
     write_video(folders, tmp_path / "v.gif", 4.0)
     assert ends[0] == pytest.approx((2.0, 3.0), rel=0.01)
+    write_video(folders, tmp_path / "near.gif", 4.0, near=1.0)
+    write_video(folders, tmp_path / "far.gif", 4.0, far=9.0)
+    assert ends[1:] == [(1.0, ends[0][1]), (ends[0][0], 9.0)]

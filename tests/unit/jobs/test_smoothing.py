@@ -133,6 +133,13 @@ def test_the_report_describes_the_smoothed_maps_and_keeps_the_values_of_the_fram
             }
 
 
+def test_maps_with_removed_depths_have_no_mean_confidence(run):
+    """The confidence of removed depths is removed as well, so a mean would be that of the best pixels."""
+    options = replace(run["options"], holes=True, min_confidence=0.5)
+    for report in write_smoothed_frames(options, run["refs"][:2], lambda ref: None):
+        assert report["temporal_smoothing"]["confidence_mean"] is None
+
+
 def test_images_and_cloud_are_written_again(run, tmp_path, monkeypatch):
     drawn = []
     options = replace(run["options"], max_sigma=0.25)
@@ -234,5 +241,5 @@ def test_a_disk_that_is_full_ends_it_with_a_sentence(run, monkeypatch):
         yield
 
     monkeypatch.setattr(smoothing, "write_smoothed", full)
-    with pytest.raises(InputError, match=r"--temporal-smoothing failed \(No space left on device\)"):
+    with pytest.raises(InputError, match=r"--temporal-smoothing failed for \S+ \(No space left on device\)"):
         write_smoothed_frames(run["options"], run["refs"][:2], lambda ref: None)

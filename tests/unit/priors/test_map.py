@@ -1,5 +1,7 @@
 """Maps of other models as priors: units, holes, sizes and batches."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -159,13 +161,14 @@ def test_a_small_range_far_from_0_survives_in_double_precision(pipe):
     assert corner.shape == (1, 1, 2, 2) and lowest == make_map()[:2, :2].min()
 
 
-@pytest.mark.parametrize("space", ["depth", "disparity"])
+@pytest.mark.parametrize("space", ["depth", "disparity", "log"])
 @pytest.mark.parametrize("step", [1, 2])
 def test_the_ends_of_a_map_in_metres_are_known(space, step):
-    """A map at another size has the same ends; a hole has none."""
+    """A map at another size has the same ends; a hole has none. Logarithms may be negative."""
     pipe = load_prior("map", space=space)
-    depth_m = np.linspace(2.0, 6.0, SIZE[0] * SIZE[1]).reshape(SIZE)[::step, ::step].copy()
-    given = depth_m if space == "depth" else 1 / depth_m
+    first = 0.5 if space == "log" else 2.0
+    depth_m = np.linspace(first, 6.0, SIZE[0] * SIZE[1]).reshape(SIZE)[::step, ::step].copy()
+    given = {"depth": depth_m.copy(), "disparity": 1 / depth_m, "log": np.log(depth_m)}[space]
     given[0, 3] = np.nan
     condition(pipe, given)
     maps = pipe.maps_of(slice(None))
@@ -174,11 +177,12 @@ def test_the_ends_of_a_map_in_metres_are_known(space, step):
     found = metric(torch.as_tensor(x), metric.from_range(*maps.own_range[:2]))
     known = np.isfinite(given)
     if step == 1:
-        np.testing.assert_allclose(found[0, 0].numpy()[known], depth_m[known], rtol=2e-3)
+        np.testing.assert_allclose(found[0, 0].numpy()[known], depth_m[known], rtol=3e-3)
     assert maps.given and maps.depth_range is None
     nearest, farthest = (float(end) for end in maps.own_range[:2])
-    assert nearest == pytest.approx(2.0 if space == "depth" else np.quantile(depth_m[known], 0.02), rel=0.02)
-    assert farthest == pytest.approx(np.quantile(depth_m[known], 0.98) if space == "depth" else 6.0, rel=0.03)
+    quantile = np.quantile(depth_m[known], 0.02 if space == "disparity" else 0.98)
+    expected = (quantile, 6.0) if space == "disparity" else (first, quantile)
+    assert (nearest, farthest) == pytest.approx(expected, rel=0.03)
 
 
 def test_a_map_with_values_below_0_is_not_in_metres(pipe):
@@ -188,6 +192,7 @@ def test_a_map_with_values_below_0_is_not_in_metres(pipe):
     pipe.prepare_condition(torch.zeros(2, 3, *SIZE), 2, 1, None, [below, above])
     near_m = pipe.maps_of(slice(None)).own_range.near_m
     assert near_m.isnan().tolist() == [True, True, False, False]
+    assert all(math.isnan(end) for end in module._metres("log", 1.0, 100.0)), "e^100 is not a depth"
 
 
 @pytest.mark.parametrize("factor", [0.4, 1.4, 1.5, 2.0])
