@@ -247,7 +247,7 @@ COMMANDS = {
         "Evaluate this package and other methods on datasets.",
     ),
 }
-ABOUT = "Metric depth from two images with known cameras, using any Marigold-style diffusion prior."
+ABOUT = "Metric depth from a monocular depth model and a second view, known depths or a moving camera."
 app = click.version_option(package_name="geodiff-plugin", message="%(package)s %(version)s")(
     new_group(ABOUT, COMMANDS, outermost=True)
 )
