@@ -60,6 +60,12 @@ NUMBERS = {
     "near": "Nearest depth, m",
     "far": "Farthest depth, m",
 }
+#: Fields that appear and disappear as a part of a group of another name.
+GROUPS = {
+    **dict.fromkeys(("fx", "fy", "cx", "cy"), "lens"),
+    "baseline_error": "error",
+    "known_length": "length",
+}
 #: Fields that accept a unit, such as "12 cm".
 LENGTHS = ("baseline", "baseline_error", "known_length", "near", "far")
 _METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -83,8 +89,12 @@ class Form:
             InputError: A field is missing or wrong.
         """
         named = dict(zip(self.fields, values, strict=True))
-        for name in NUMBERS:
-            named[name] = _number(named[name], name)
+        for side in ("left", "right"):
+            if named[side] and not Path(named[side]).is_file():
+                raise PageError(f"The {side} image is no longer on the server. Drop it again.")
+        shown = _shown(*(named[name] for name in ("camera_input", "camera", "scale_input")))
+        for name in NUMBERS:  # of fields that are not shown, whatever was typed there has no meaning
+            named[name] = _number(named[name], name) if shown.get(GROUPS.get(name, name), True) else None
         named["lens"] = {name: named.pop(name) for name in ("fx", "fy", "cx", "cy")}
         named |= {name: int(named[name] or 0) for name in ("steps", "ensemble", "resolution", "seed")}
         named |= {name: named[name] or None for name in ("steps", "resolution")}  # 0: the prior's default
@@ -271,14 +281,21 @@ def _show_groups(groups: list[str]) -> str:
     The browser looks them up: the form changes at once, and no answer to an earlier change can arrive last.
     """
     sources = product(CAMERA_INPUTS, FOCAL_INPUTS, SCALE_INPUTS)
-    updates = {",".join(source): _shown(groups, *source) for source in sources}
+    updates = {",".join(source): _updates(groups, *source) for source in sources}
     return templates.show_groups(updates, list(FOCAL_INPUTS))
 
 
-def _shown(groups: list[str], camera_input: str, camera: str, scale_input: str) -> list[Any]:
-    """Return which groups of fields appear, and the distance's placeholder."""
+def _updates(groups: list[str], camera_input: str, camera: str, scale_input: str) -> list[Any]:
+    """Return the updates of groups of fields, with the placeholder of the distance."""
+    shown = _shown(camera_input, camera, scale_input)
+    more = {"baseline": {"placeholder": BASELINE_PLACEHOLDERS[camera_input]}}
+    return [gr.update(visible=shown[name], **more.get(name, {})) for name in groups]
+
+
+def _shown(camera_input: str, camera: str, scale_input: str) -> dict[str, bool]:
+    """Return which groups of fields appear, for these sources of the cameras, focal length and scale."""
     by_images = camera_input == "images"
-    shown = {
+    return {
         "calib": camera_input == "file",
         "formats": camera_input == "file",
         "poselib": by_images and not can_estimate(),
@@ -292,9 +309,6 @@ def _shown(groups: list[str], camera_input: str, camera: str, scale_input: str) 
         "guess": by_images and scale_input == "guess",
         "length": by_images and scale_input == "known",
     }
-    placeholder = {"placeholder": BASELINE_PLACEHOLDERS[camera_input]}
-    more = {"baseline": placeholder}
-    return [gr.update(visible=shown[name], **more.get(name, {})) for name in groups]
 
 
 def _length_fields(drawn: dict[str, Any]) -> None:
@@ -304,8 +318,9 @@ def _length_fields(drawn: dict[str, Any]) -> None:
     drawn["ends"] = gr.Textbox(
         label="Its two ends, px", placeholder="tap them above", max_lines=1, elem_id="ends"
     )
+    # At once: they are of the previous image.
+    drawn["left"].change(None, None, [image, drawn["ends"]], js="() => ['', '']", queue=False)
     drawn["left"].change(_known_image, drawn["left"], image, **IN_ORDER)
-    drawn["left"].change(lambda: "", outputs=drawn["ends"], **QUICK)
 
 
 def _settings(priors: Priors) -> dict[str, Any]:

@@ -219,9 +219,13 @@ class _Handlers:
     def keep(self, session: Session, notice: str) -> dict[Any, Any]:
         """Return a notice above the result that stays on display, or no result if it has expired."""
         result = self.sessions.result(session)
-        if result is not None:
-            return {self.panels.status: templates.earlier(notice, result.shown)}
-        return {self.panels.paths: None, **self.on_panels(_nothing(notice))}
+        if result is None:
+            return {self.panels.paths: None, **self.on_panels(_nothing(notice))}
+        shown = {}
+        if session.drawn != session.secret:  # this run began before the result was drawn
+            shown = {self.secret: session.secret, **self.on_panels(_all_drawn(result))}
+            session.drawn = session.secret
+        return shown | {self.panels.status: templates.earlier(notice, result.shown)}
 
     def compute(self, session: Session, run: Run, request: Request, progress: Any) -> PairRun:
         """Run a job, and make its result the one of the session."""
@@ -230,11 +234,11 @@ class _Handlers:
         self.sessions.show(session, run, shown, _measurable(shown, request))
         return job
 
-    def write(self, secret: str, job: PairRun) -> dict[Any, Any]:
-        """Write the files of a result; return the values of their components."""
+    def write(self, session: Session, secret: str, job: PairRun) -> dict[Any, Any]:
+        """Write the files of a result; return the values of their components if it is still on display."""
         folder = clean_report(write_job(job))
         result = self.sessions.store.get(secret) if self.sessions.store.add_files(secret, folder) else None
-        if result is None:
+        if result is None or session.secret != secret:
             return {}
         paths = results.files_of(result)
         return {self.panels.paths: [str(path) for path in paths], **self.on_panels(_files(result))}
@@ -254,7 +258,9 @@ class _Handlers:
                 return
             for html in drawn(result, session.tab):
                 yield {self.secret: secret, **self.on_panels(html), **self.controls("")}
-            yield self.write(secret, job)
+            if session.run is run:  # a later run may have kept the page from drawing them
+                session.drawn = secret
+            yield self.write(session, secret, job)
 
     def run(
         self, session: Session, filled: tuple[Any, ...], progress: Any, values: dict[Any, Any]
@@ -269,7 +275,8 @@ class _Handlers:
         try:
             request = self.form.request(filled)
             for shown in self.steps(session, run, request, progress):
-                if shown and session.run is run:
+                # Files are shown also if a later run has begun, because they are of the result on display.
+                if shown and (session.run is run or self.secret not in shown):
                     yield shown
             ended: dict[Any, Any] = {}
         except Stopped:
@@ -284,14 +291,25 @@ class _Handlers:
         """Return the box of a run, empty if there is none, and the stop button, which is active in a run."""
         return {self.progress: running, self.form.stop: gr.update(interactive=bool(running))}
 
+    def session_of(self, request: gr.Request, secret: str) -> Session:
+        """Return the session of a page that shows the result of this secret.
+
+        If the connection was lost, the session was forgotten, but the page is still open.
+        """
+        session = self.sessions.of(request.session_hash)
+        if not session.secret and session.run is None:
+            session.secret = session.drawn = secret
+        return session
+
     def estimate(
         self,
         request: gr.Request,
+        secret: str,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
         *values: Any,
     ) -> Iterator[dict[Any, Any]]:
         """Estimate metric depth of the left image and write its files."""
-        yield from self.run(self.sessions.of(request.session_hash), values, progress, {})
+        yield from self.run(self.session_of(request, secret), values, progress, {})
 
     def estimate_at_once(
         self,
@@ -310,12 +328,13 @@ class _Handlers:
         self,
         request: gr.Request,
         event: gr.SelectData,
+        secret: str,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> Iterator[dict[Any, Any]]:
         """Fill in an example and run it."""
         values = self.form.example(int(event.index))
         filled = dict(zip(self.form.fields.values(), values, strict=True))
-        yield from self.run(self.sessions.of(request.session_hash), tuple(values), progress, filled)
+        yield from self.run(self.session_of(request, secret), tuple(values), progress, filled)
 
     def stop(self, request: gr.Request) -> None:
         """Stop the visitor's run before its next step."""
@@ -326,31 +345,25 @@ class _Handlers:
         paths = [left, right, *(files or ())]
         self.sessions.of(request.session_hash).uploads |= _uploads(paths)
 
-    def restore(self, request: gr.Request, secret: str, by_phone: bool) -> dict[Any, Any]:
+    def restore(self, request: gr.Request, secret: str) -> dict[Any, Any]:
         """Return the result that a tab had before a reload, if it has not expired."""
         result = self.sessions.store.get(secret)
-        restored = {self.secret: ""} if result is None else self._restored(request, secret, result)
-        # A phone's visitors have no calibration, so its form begins with the images alone.
-        preset = {self.form.fields["camera_input"]: "images"} if by_phone else {}
-        return restored | preset
+        return {self.secret: ""} if result is None else self._restored(request, secret, result)
 
     def _restored(self, request: gr.Request, secret: str, result: Result) -> dict[Any, Any]:
         """Return the updates that show a result, and make it the one of the visitor's session."""
         self.sessions.store.end_in(secret, FORGET_AFTER_S)
-        self.sessions.of(request.session_hash).secret = secret
+        session = self.sessions.of(request.session_hash)
+        session.secret = session.drawn = secret
         shown = {self.secret: secret, self.panels.paths: [str(path) for path in results.files_of(result)]}
-        for html in drawn(result):
-            shown |= self.on_panels(html)
-        return shown
+        return shown | self.on_panels(_all_drawn(result))
 
     def measure(self, request: gr.Request, secret: str, change: Any) -> dict[Any, Any]:
         """Change the pixels of the result on display by ``change``, and update what shows them.
 
         ``secret`` belongs to the result that the visitor saw. Nothing happens if another one replaced it.
         """
-        session = self.sessions.of(request.session_hash)
-        if not session.secret and session.run is None:
-            session.secret = secret  # the connection was lost and the session forgotten
+        session = self.session_of(request, secret)
         if secret != session.secret:
             return {self.panels.readings: gr.skip()}
         result = self.sessions.result(session)
@@ -400,6 +413,11 @@ class _Handlers:
         self.sessions.leave(request.session_hash)
 
 
+def _all_drawn(result: Result) -> dict[str, str]:
+    """Return the HTML of all panels by their names."""
+    return {name: html for panels in drawn(result) for name, html in panels.items()}
+
+
 def _measurable(shown: Shown, request: Request) -> list[tuple[int, int]]:
     """Return the ends of the known length if both have a depth, so that the result shows them."""
     try:
@@ -441,8 +459,8 @@ def _wire_run(desk: _Handlers, examples: gr.Gallery) -> None:
         "api_visibility": "private",
     }
     for event in (
-        form.run.click(desk.estimate, fields_of_form, outputs, **shows),
-        examples.select(desk.run_example, None, [*fields_of_form, *outputs], **shows),
+        form.run.click(desk.estimate, [desk.secret, *fields_of_form], outputs, **shows),
+        examples.select(desk.run_example, desk.secret, [*fields_of_form, *outputs], **shows),
     ):
         event.then(None, js=templates.RUN_ENDS, queue=False, api_visibility="private")
     # At once, so that a reload while the files are written finds the result.
@@ -457,7 +475,9 @@ def _wire_form(desk: _Handlers, examples: gr.Gallery) -> None:
     gr.on(images, lambda: gr.Gallery(selected_index=None), None, examples, **QUICK)  # no longer an example
     gr.on([field.upload for field in drops], desk.note_uploads, drops, None, **QUICK)
     changes = [event for field in drops for event in (field.upload, field.clear)]
-    gr.on(changes, None, js=templates.CHANGED, queue=False)
+    # The browser's own events do not report these, and gradio's do not report values set by an example.
+    chosen = [field for field in desk.form.fields.values() if isinstance(field, (gr.Dropdown, gr.Slider))]
+    gr.on([*changes, *(field.input for field in chosen)], None, js=templates.CHANGED, queue=False)
 
 
 def _wire_measuring(desk: _Handlers) -> None:
@@ -528,20 +548,20 @@ def build_page(priors: Priors) -> gr.Blocks:
         fill_width=True,
     ) as page:
         gr.HTML(templates.HEADER)
-        secret, by_phone = gr.Textbox(visible="hidden"), gr.Checkbox(visible="hidden")
+        secret = gr.Textbox(visible="hidden")
         with gr.Row(equal_height=False, elem_id="main"):
             with gr.Column(elem_id="examples-panel"):
                 examples = build_examples()
             with gr.Column(elem_id="results"):
                 progress = gr.HTML(elem_id="progress")
-                panels = _build_panels({k: v for html in drawn(first) for k, v in html.items()})
+                panels = _build_panels(_all_drawn(first))
             with gr.Column(elem_id="form"):
                 form = build_form(priors)
         desk = _Handlers(form, panels, secret, priors, sessions, RunQueue(), progress)
         _wire_run(desk, examples)
         _wire_form(desk, examples)
         _wire_measuring(desk)
-        restored = [*desk.of_result(), form.fields["camera_input"]]
-        page.load(desk.restore, [secret, by_phone], restored, js=templates.COME_BACK, **QUICK)
+        page.load(None, None, form.fields["camera_input"], js=templates.PHONE_CAMERAS, queue=False)
+        page.load(desk.restore, secret, desk.of_result(), js=templates.COME_BACK, **QUICK)
         page.unload(desk.leave)
     return page

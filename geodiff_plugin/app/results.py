@@ -291,6 +291,11 @@ def files_of(result: Result) -> list[Path]:
     folder = result.shown.folder
     if folder is None:
         return []
+    with result.writing:
+        return _write_files(result, folder)
+
+
+def _write_files(result: Result, folder: Path) -> list[Path]:
     archive_is_old = _write_measurements(folder / MEASUREMENTS, Measurement.of(result).csv())
     own = {path.name for path in folder.iterdir() if path.is_file()} - {ARCHIVE}
     *wanted, last = PURPOSES

@@ -53,10 +53,11 @@ def delete_uploads(folders: Iterable[Path]) -> None:
 
 @dataclass(eq=False)
 class Result:
-    """A result on display, and the pixels measured in it."""
+    """A result on display, and the pixels measured in it; ``writing`` is held while its files are written."""
 
     shown: Shown
     pixels: Pixels = field(default_factory=list)
+    writing: threading.Lock = field(default_factory=threading.Lock)
 
 
 class ResultStore:
@@ -122,6 +123,7 @@ class Session:
     Attributes:
         first: the precomputed result with this visitor's points, on display until the first run.
         secret: secret of the result on display; empty for the precomputed one.
+        drawn: secret of the result that the page shows; not yet ``secret`` if a later run began meanwhile.
         run: the latest run, ``None`` when it has ended.
         uploads: folders of the visitor's uploads.
         tab: name of the open tab of the result.
@@ -129,6 +131,7 @@ class Session:
 
     first: Result
     secret: str = ""
+    drawn: str = ""
     run: Run | None = None
     uploads: set[Path] = field(default_factory=set)
     tab: str = ""

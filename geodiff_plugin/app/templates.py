@@ -61,10 +61,11 @@ BACK_TO_FORM = '<a class="to-form" href="#form">Back to the form</a>'
 STALE = "Inputs changed. These results are out of date; run again."
 #: Sees what a visitor types or chooses: only the browser's own events fire it, not values set by an example.
 WATCH_FORM = f"document.getElementById('form').addEventListener('input', {CHANGED});"
-#: A tab's secret is stored in that tab only; it is kept when the tab is reloaded. Phones have no calibration.
-COME_BACK = (
-    f"() => {{ {WATCH_FORM} return [sessionStorage.getItem('geodiff-result') || '', "
-    "matchMedia('(pointer: coarse)').matches || innerWidth < 500]; }"
+#: A tab's secret is stored in that tab only; it is kept when the tab is reloaded.
+COME_BACK = f"() => {{ {WATCH_FORM} return sessionStorage.getItem('geodiff-result') || ''; }}"
+#: A phone's visitors have no calibration, so its form begins with the images alone.
+PHONE_CAMERAS = (
+    "() => matchMedia('(pointer: coarse)').matches || innerWidth < 500 ? 'images' : { __type__: 'update' }"
 )
 #: Passes the clicked pixel in place of the hidden field's value.
 PICKED = "(secret, _) => [secret, window.geodiffPicked]"

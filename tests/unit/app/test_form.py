@@ -106,8 +106,23 @@ def test_every_field_becomes_its_own_option(drawn, pair):
         ("baseline", "not 'x'. If you know it only roughly, choose \"Estimate from the images\""),
         ("cx_right", "Right camera's cx, px: enter a number such as 812.5, not 'x'."),
     ):
+        shown = {"known_length": {"camera_input": "images", "scale_input": "known"}}
+        source = shown.get(name, {"camera_input": "numbers"})
         with pytest.raises(PageError, match=message):
-            options_of(drawn, filled | {name: "x"})
+            options_of(drawn, filled | source | {name: "x"})
+
+
+def test_what_was_typed_in_a_field_that_is_no_longer_shown_is_ignored(drawn, pair):
+    filled = drawn.form.initial | pair | NUMBERS
+    hidden = dict.fromkeys(("known_length", "baseline_error", "fov", "cx_right", "fx"), "some")
+    options = options_of(drawn, filled | hidden | {"camera_input": "file"})
+    assert options.baseline == 0.125 and options.fx is options.fov is options.cx_right is None
+
+
+def test_an_image_that_is_no_longer_on_the_server_is_named(drawn, pair):
+    Path(pair["right"]).unlink()
+    with pytest.raises(PageError, match="The right image is no longer on the server. Drop it again."):
+        options_of(drawn, drawn.form.initial | pair)
 
 
 @pytest.mark.parametrize(
@@ -240,20 +255,20 @@ def test_at_first_the_fields_of_a_calibration_file_are_seen(drawn):
     ],
 )
 def test_a_source_shows_the_fields_that_it_needs_with_fitting_placeholders(given, seen, monkeypatch):
-    from geodiff_plugin.app.form import _shown
+    from geodiff_plugin.app.form import _updates
 
     groups = "calib formats poselib camera fov lens cx_right scale baseline error guess length".split()
-    updates = dict(zip(groups, _shown(groups, *given), strict=True))
+    updates = dict(zip(groups, _updates(groups, *given), strict=True))
     assert {name for name, update in updates.items() if update["visible"]} == seen
     placeholders = {"file": "from the file", "numbers": "required", "images": "such as 12 cm"}
     assert updates["baseline"]["placeholder"] == placeholders[given[0]]
     monkeypatch.setattr("geodiff_plugin.app.form.can_estimate", lambda: False)
-    updates = dict(zip(groups, _shown(groups, *given), strict=True))
+    updates = dict(zip(groups, _updates(groups, *given), strict=True))
     assert updates["poselib"]["visible"] == (given[0] == "images"), "a missing package is reported at once"
 
 
 def test_the_browser_shows_the_fields_of_a_source_without_a_request(drawn):
-    from geodiff_plugin.app.form import _shown
+    from geodiff_plugin.app.form import _updates
 
     fields = [drawn.form.fields[name] for name in ("camera_input", "camera", "scale_input")]
     handler = handlers(drawn, fields[2], "change")[0]
@@ -262,7 +277,7 @@ def test_the_browser_shows_the_fields_of_a_source_without_a_request(drawn):
     assert handlers(drawn, fields[0], "change")[0] is handler, "before others, whose answers it would await"
     updates, _ = json.JSONDecoder().raw_decode(handler.js, handler.js.index('{"images,'))
     assert len(updates) == 3 * 3 * 3
-    one = _shown(["fov", "baseline"], "images", "fov", "guess")
+    one = _updates(["fov", "baseline"], "images", "fov", "guess")
     shown = dict(zip((output._id for output in handler.outputs), updates["images,fov,guess"], strict=True))
     assert [shown[drawn.form.fields[name]._id] for name in ("fov", "baseline")] == one
 
@@ -308,8 +323,12 @@ def test_the_left_image_is_shown_for_taps_on_the_ends_of_a_known_length(drawn, p
     html = handler.fn(pair["left"])
     assert 'data-picked="ends" data-width="64" data-height="48"' in html and "data:image/jpeg" in html
     assert handler.fn(None) == handler.fn(__file__) == ""
-    (clear,) = [f for f in handlers(drawn, fields["left"], "change") if not f.inputs]
-    assert clear.fn() == "" and [output._id for output in clear.outputs] == [fields["ends"]._id]
+    (clear,) = [f for f in of_field if f.js]
+    assert not clear.fn and [output._id for output in clear.outputs] == [
+        handler.outputs[0]._id,
+        fields["ends"]._id,
+    ]
+    assert of_field.index(clear) < of_field.index(handler), "at once, and not after the new image"
 
 
 def test_a_run_is_named_by_its_files_before_they_are_checked(drawn, pair):

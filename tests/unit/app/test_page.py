@@ -146,7 +146,8 @@ def jobs(page, desk, monkeypatch, tmp_path):
 def run(desk, jobs, outcome, screen: Screen, during=lambda: None, filled=(1, 2)) -> list[dict]:
     """A click on the button whose job gives this result, or raises this error; returns all updates."""
     jobs.outcome, jobs.during = outcome, during
-    steps = desk.estimate(asks(screen.visitor), lambda *now: jobs.reported.append(now), *filled)
+    secret = screen.shows["secret"]
+    steps = desk.estimate(asks(screen.visitor), secret, lambda *now: jobs.reported.append(now), *filled)
     return [screen.apply(update) for update in steps]
 
 
@@ -259,8 +260,8 @@ def test_clicks_call_what_they_should_with_their_fields(page, desk):
     shows |= {"show_progress_on": [desk.progress], "js": templates.RUN_BEGINS, "api_visibility": "private"}
     (by_button,), (by_example,) = page.of("estimate"), page.of("run_example")
     on_screen = [*outputs, desk.progress, form.stop]
-    check(by_button, [(form.run, "click")], fields, on_screen, **shows)
-    check(by_example, None, [], [*fields, *on_screen], **shows)
+    check(by_button, [(form.run, "click")], [secret, *fields], on_screen, **shows)
+    check(by_example, None, [secret], [*fields, *on_screen], **shows)
     (by_client,) = page.of("estimate_at_once")
     check(by_client, None, fields, outputs, api_name="estimate")
     ends = [f for f in page.fns if f.js == templates.RUN_ENDS]
@@ -271,7 +272,10 @@ def test_clicks_call_what_they_should_with_their_fields(page, desk):
     drops = [form.fields[name] for name in ("left", "right", "calib")]
     check(page.of("note_uploads")[0], [(field, "upload") for field in drops], drops, [], **quick)
     (changed,) = [f for f in page.fns if f.js == templates.CHANGED]
-    check(changed, [(field, event) for field in drops for event in ("upload", "clear")], [], [], queue=False)
+    events = [(field, event) for field in drops for event in ("upload", "clear")]
+    chosen = ("camera", "guess", "prior", "preset", "steps", "ensemble", "resolution")
+    events += [(form.fields[name], "input") for name in chosen]
+    check(changed, events, [], [], queue=False)
     measured = [panels.marks_data, panels.headline, panels.depth_headline, panels.readings, panels.status]
     in_order = quick | {"queue": True, "trigger_mode": "multiple", "concurrency_limit": 1}
     in_order |= {"concurrency_id": "points"}
@@ -287,7 +291,9 @@ def test_clicks_call_what_they_should_with_their_fields(page, desk):
         check(page.of(name)[0], [(button, "click") for button in buttons], [secret], measured, **in_order)
     check(page.of("open_tab")[0], [(panels.tabs, "select")], [secret], [panels.files], **quick)
     (back,) = page.of("restore")
-    assert back.outputs == [*outputs, form.fields["camera_input"]] and back.js == templates.COME_BACK
+    assert back.outputs == outputs and back.js == templates.COME_BACK
+    (phone,) = [f for f in page.fns if f.js == templates.PHONE_CAMERAS]
+    assert phone.outputs == [form.fields["camera_input"]] and not phone.fn, "the browser does not ask"
     assert len(page.of("leave")) == 1
 
 
@@ -398,7 +404,7 @@ def test_a_later_click_ends_the_earlier_run_without_a_message(desk, jobs):
     def click_again():
         jobs.during = lambda: None
         jobs.outcome = made_result(name="first")
-        second.append(desk.estimate(asks(), lambda *_: None, 1, 2))
+        second.append(desk.estimate(asks(), "", lambda *_: None, 1, 2))
         screen.apply(next(second[0]))
 
     updates = run(desk, jobs, made_result(name="first"), screen, during=click_again)
@@ -409,6 +415,34 @@ def test_a_later_click_ends_the_earlier_run_without_a_message(desk, jobs):
         screen.apply(update)
     assert "second" in screen.shows["status"] and screen.shows["progress"] == ""
     assert is_drawn(screen.shows, desk.sessions.result(desk.sessions.of("tab")))
+
+
+def test_a_run_that_begins_before_the_earlier_result_is_drawn_draws_it(page, desk, jobs, monkeypatch):
+    """The earlier result is already that of the tab, so it is what the later run keeps on display."""
+    screen, second, draw = Screen(desk), [], page.module.drawn
+
+    def click_again(*given):
+        if not second:
+            second.append(desk.estimate(asks(), screen.shows["secret"], lambda *_: None, 1, 2))
+            screen.apply(next(second[0]))
+        return draw(*given)
+
+    monkeypatch.setattr(page.module, "drawn", click_again)
+    run(desk, jobs, made_result(name="first"), screen)
+    result = desk.sessions.result(desk.sessions.of("tab"))
+    assert "previous result, for first" in screen.shows["status"]
+    assert screen.shows["progress"] == templates.running("what runs") and "depth.npy" in screen.shows["files"]
+    assert is_drawn(screen.shows | {"status": templates.banner(result.shown)}, result)
+    assert screen.shows["secret"] == desk.sessions.of("tab").secret
+
+
+def test_a_run_after_a_lost_connection_keeps_what_the_page_shows(desk, jobs):
+    screen = Screen(desk)
+    run(desk, jobs, made_result(name="mine"), screen)
+    desk.sessions._of.pop("tab")
+    begun, *_ = run(desk, jobs, coded("memory"), screen)
+    assert "previous result, for mine" in begun["status"]
+    assert "previous result, for mine" in screen.shows["status"]
 
 
 def test_a_waiting_visitor_sees_how_many_runs_are_ahead(desk, jobs, monkeypatch):
@@ -427,7 +461,7 @@ def test_a_waiting_visitor_sees_how_many_runs_are_ahead(desk, jobs, monkeypatch)
 
     screen = Screen(desk)
     try:
-        for update in desk.estimate(asks(), notify, 1, 2):
+        for update in desk.estimate(asks(), "", notify, 1, 2):
             screen.apply(update)
     finally:
         desk.queue._lock.release()
@@ -450,14 +484,12 @@ def test_a_reloaded_tab_gets_its_result_again_with_its_points(desk, jobs, monkey
     screen.click(5, 7)
     seconds, secret = [], screen.shows["secret"]
     monkeypatch.setattr(desk.sessions.store, "end_in", lambda *given: seconds.append(given))
-    values = named(desk, desk.restore(asks("again"), secret, False))
+    values = named(desk, desk.restore(asks("again"), secret))
     assert values["secret"] == secret == desk.sessions.of("again").secret and seconds == [(secret, 600)]
     result = desk.sessions.store.get(secret)
     assert result.pixels == [(5, 7)] and is_drawn(values, result, results.files_of(result))
-    assert named(desk, desk.restore(asks("b"), "gone", False)) == {"secret": ""}
+    assert named(desk, desk.restore(asks("b"), "gone")) == {"secret": ""}
     assert desk.sessions.of("b").secret == ""
-    phone = named(desk, desk.restore(asks("phone"), "", True))
-    assert phone == {"secret": "", "field camera_input": "images"}, "no calibration is at hand"
 
 
 def test_points_belong_to_the_result_that_was_clicked(desk, jobs):
@@ -601,7 +633,7 @@ class Visit(RuleBasedStateMachine):
         self.count += 1
         name = f"pair {self.count}"
         filled = (PageError("A field is missing."),) if missing else (name, fails)
-        steps = self.desk.estimate(asks(), lambda *_: None, *filled)
+        steps = self.desk.estimate(asks(), self.screen.shows["secret"], lambda *_: None, *filled)
         self.screen.apply(next(steps))
         self.running.append((steps, name, fails))
 
@@ -612,6 +644,14 @@ class Visit(RuleBasedStateMachine):
             self.jobs.outcome = coded("memory") if fails else made_result(name=name)
             for update in steps:
                 self.screen.apply(update)
+
+    @rule()
+    def click_run_while_a_result_is_drawn(self):
+        if self.running:
+            steps, name, fails = self.running[0]
+            self.jobs.outcome = coded("memory") if fails else made_result(name=name)
+            self.screen.apply(next(steps, {}))
+            self.click_run(False, False)
 
     @rule()
     def stop(self):
@@ -638,7 +678,7 @@ class Visit(RuleBasedStateMachine):
             for html in drawn_of(self.desk, first):
                 self.screen.shows |= html
             self.desk.sessions._of.pop("tab")
-            self.screen.apply(self.desk.restore(asks(), secret, False))
+            self.screen.apply(self.desk.restore(asks(), secret))
 
     @invariant()
     def everything_belongs_together(self):

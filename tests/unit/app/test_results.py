@@ -7,6 +7,9 @@ import re
 import zlib
 from base64 import b64decode
 from dataclasses import replace
+from pathlib import Path
+from threading import Thread
+from types import SimpleNamespace
 from zipfile import ZIP_DEFLATED, ZipFile
 
 import matplotlib
@@ -48,6 +51,19 @@ def from_url(url: str) -> np.ndarray:
     assert head == "data:image/jpeg;base64"
     with Image.open(io.BytesIO(b64decode(body))) as image:
         return np.asarray(image)
+
+
+def test_files_are_listed_when_no_one_writes_them():
+    """The run and the visitor who opens the tab would otherwise write one archive."""
+    result, listed = Result(made_result()), []
+    result.shown = SimpleNamespace(folder=Path("missing"))
+    thread = Thread(target=lambda: listed.append(pytest.raises(OSError, results.files_of, result)))
+    with result.writing:
+        thread.start()
+        thread.join(0.2)
+        assert thread.is_alive()
+    thread.join(10)
+    assert len(listed) == 1
 
 
 def test_an_image_is_its_own_address():
