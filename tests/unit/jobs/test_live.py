@@ -109,6 +109,16 @@ def test_a_run_that_fails_before_its_first_result_leaves_the_folder_as_it_was(op
     assert contents(out) == earlier
 
 
+def test_a_replaced_recording_has_the_intrinsics_of_its_own_run(options, textured_plane, pipe):
+    options = replace(options, out=Path("out"), frames=1)
+    results_of(options, pipe=pipe)
+    fx, baseline = 1.1 * float(textured_plane.K[0, 0]), float(textured_plane.E[0, 3])
+    (other,) = results_of(replace(options, overwrite=True, calib=(), fx=fx, baseline=baseline), pipe=pipe)
+    K = np.loadtxt("out/K.txt")
+    assert K[0, 0] == pytest.approx(fx)
+    np.testing.assert_allclose(K, np.asarray(other.frame.output.K)[0])
+
+
 def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
