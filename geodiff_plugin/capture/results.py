@@ -73,6 +73,15 @@ BLOCK = 16
 BLOCKS = 10_000
 #: Number of frames after which points are merged, so that a long capture fits in memory.
 MERGED_AFTER = 20
+#: Suffix of COLMAP's name for a map of an image.
+OF_COLMAP = ".png.geometric.bin"
+#: Folders of a COLMAP workspace with one file per frame: the frame's name and this suffix.
+PER_FRAME = {
+    "images": ".png",
+    "depth": ".tiff",
+    "stereo/depth_maps": OF_COLMAP,
+    "stereo/normal_maps": OF_COLMAP,
+}
 #: Columns of the cloud.
 VERTEX = (*"xyz", "nx", "ny", "nz", "red", "green", "blue", "sigma")
 
@@ -510,33 +519,48 @@ def write_workspace(
     ``points (M, 3)`` are points of the solve, ``seen`` the indices per frame; COLMAP chooses pairs by shared
     points. The same depth is in ``depth/`` as float32 TIFF, 0 where unknown, for splatting with Brush.
     Source: pull request 497 of ArthurBrussee/brush, which reads ``depth/<stem of the image>.tiff``.
+    Files of frames that only an earlier export had are deleted, because trainers read whole folders.
     """
-    of_stereo = ("depth_maps", "normal_maps", "consistency_graphs")
-    for name in ("images", "depth", "sparse", *(f"stereo/{each}" for each in of_stereo)):
+    for name in (*PER_FRAME, "sparse", "stereo/consistency_graphs"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     views = []
-    maps = folder / "stereo"
     colours = np.zeros(points.shape, np.uint8)
     for frame, (px, rows) in zip(frames, seen, strict=True):
         rgb = plotting.as_rgb_image(image(frame.name))
-        save_png(rgb, folder / "images" / f"{frame.name}.png")
         u, v = np.rint(px).astype(int).T.clip(0, np.array(rgb.size)[:, None] - 1)
         colours[rows] = np.asarray(rgb)[v, u]
-        depth = np.where(kept(frame), frame.depth, 0).astype(np.float32)
-        with atomic_path(folder / "depth" / f"{frame.name}.tiff") as temporary:
-            Image.fromarray(depth).save(temporary)
-        file = f"{frame.name}.png.geometric.bin"
-        write_map(maps / "depth_maps" / file, depth[..., None])
-        write_map(maps / "normal_maps" / file, normals_of(frame.depth, frame.camera))
+        _write_frame_files(folder, frame, rgb)
         views.append((f"{frame.name}.png", frame.camera.K, frame.camera.E, rgb.size))
+    _delete_others(folder, {file.removesuffix(".png") for file, *_ in views})
     rows, counts = np.unique(np.concatenate([each for _, each in seen]), return_counts=True)
     rows = rows[counts > 1]
     place = np.full(len(points), -1)
     place[rows] = np.arange(len(rows))
     tracks = [(px[place[each] >= 0], place[each][place[each] >= 0]) for px, each in seen]
     write_colmap(folder / "sparse", views, Cloud(points[rows], colours[rows]), tracks)
-    write_text(maps / "fusion.cfg", "".join(f"{file}\n" for file, *_ in views))
-    write_text(maps / "patch-match.cfg", "".join(f"{file}\n__auto__, 20\n" for file, *_ in views))
+    write_text(folder / "stereo/fusion.cfg", "".join(f"{file}\n" for file, *_ in views))
+    write_text(folder / "stereo/patch-match.cfg", "".join(f"{file}\n__auto__, 20\n" for file, *_ in views))
+
+
+def _write_frame_files(folder: Path, frame: DepthFrame, rgb: Image.Image) -> None:
+    """Write the files ``PER_FRAME`` of a frame."""
+    image, tiff, depth_map, normal_map = (
+        folder / place / f"{frame.name}{suffix}" for place, suffix in PER_FRAME.items()
+    )
+    save_png(rgb, image)
+    depth = np.where(kept(frame), frame.depth, 0).astype(np.float32)
+    with atomic_path(tiff) as temporary:
+        Image.fromarray(depth).save(temporary)
+    write_map(depth_map, depth[..., None])
+    write_map(normal_map, normals_of(frame.depth, frame.camera))
+
+
+def _delete_others(folder: Path, names: Collection[str]) -> None:
+    """Delete the files ``PER_FRAME`` of other frames than those of the names."""
+    for place, suffix in PER_FRAME.items():
+        for path in (folder / place).glob(f"*{suffix}"):
+            if path.name.removesuffix(suffix) not in names:
+                path.unlink()
 
 
 def write_map(path: Path, values: np.ndarray) -> None:

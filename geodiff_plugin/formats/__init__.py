@@ -100,6 +100,7 @@ if TYPE_CHECKING:  # public names; imported on first use at run time, because so
     from geodiff_plugin.formats.out import check_new as check_new
     from geodiff_plugin.formats.out import check_new_file as check_new_file
     from geodiff_plugin.formats.out import check_out as check_out
+    from geodiff_plugin.formats.out import created_folder as created_folder
     from geodiff_plugin.formats.out import files_of_report as files_of_report
     from geodiff_plugin.formats.out import free_folder as free_folder
     from geodiff_plugin.formats.out import lock_file as lock_file

@@ -158,6 +158,16 @@ def _lock(path: Path, stack: ExitStack, shared: bool = False) -> IO[bytes] | Non
 
 
 @contextmanager
+def created_folder(folder: Path) -> Iterator[None]:
+    """Create a folder and its missing parents; when the block ends, delete those of them that are empty."""
+    with ExitStack() as stack:
+        for path in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
+            path.mkdir(exist_ok=True)
+            stack.callback(_remove_empty, path)
+        yield
+
+
+@contextmanager
 def locked_folder(folder: Path, *, shared: bool = False) -> Iterator[None]:
     """Lock a folder until the block ends, exclusively or ``shared``; raise ``InputError`` if it is locked."""
     path = folder / FOLDER_LOCK
@@ -293,9 +303,7 @@ class OutFolder:
         """Create and lock the hidden folder, and delete leftovers of a killed run."""
         staging = self._staging
         sibling = _sibling(self._target)
-        for path in reversed([path for path in (staging, *staging.parents) if not path.exists()]):
-            path.mkdir(exist_ok=True)
-            stack.callback(_remove_empty, path)
+        stack.enter_context(created_folder(staging))
         # A run that started before the folder existed writes next to it.
         if (staging != sibling and _held(sibling)) or _lock(staging / LOCK, stack) is None:
             got = f"{self.path}, which another process is writing to"

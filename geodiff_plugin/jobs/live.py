@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Generator
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import IO, Any, Self
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from geodiff_plugin.findings import Severity
 from geodiff_plugin.formats import (
     Packing,
     check_new,
+    created_folder,
     locked_folder,
     raise_unwritable,
     save_png,
@@ -139,6 +140,8 @@ def _result(frame: LiveFrame, min_confidence: float = 0.0, max_sigma: float | No
 class FrameWriter(AbstractContextManager["FrameWriter"]):
     """Writes results as they come, as an RGB-D sequence; the folder is locked meanwhile.
 
+    The first result replaces the files of an earlier run. Without any result, the folder stays as it was.
+
     Args:
         options: options with ``out`` and ``overwrite``.
 
@@ -150,40 +153,46 @@ class FrameWriter(AbstractContextManager["FrameWriter"]):
         assert options.out is not None
         self._folder = check_new(options.out, options.overwrite)
         self._stack = ExitStack()
+        self._file: IO[str] | None = None
 
     def __enter__(self) -> Self:
-        try:
-            for name in (LEFT, DEPTH, SIGMA):
-                (self._folder / name).mkdir(parents=True, exist_ok=True)
-            self._stack.enter_context(locked_folder(self._folder))
-            for name in (LEFT, DEPTH, SIGMA):
-                for path in self._folder.glob(f"{name}/*.png"):
-                    path.unlink()  # of an earlier run
-            file = open(self._folder / TABLE, "w", newline="", encoding="utf-8")  # noqa: SIM115 - closed with the stack
-        except OSError as error:
-            self._stack.close()
-            raise_unwritable(self._folder, error)
-        self._file = self._stack.enter_context(file)
-        self._table = csv.DictWriter(self._file, COLUMNS)
-        self._table.writeheader()
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(created_folder(self._folder))
+            except OSError as error:
+                raise_unwritable(self._folder, error)
+            stack.enter_context(locked_folder(self._folder))
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+
+    def _begin(self, first: LiveResult) -> IO[str]:
+        """Delete the files of an earlier run, and write what precedes the images of the first result."""
+        for name in (LEFT, DEPTH, SIGMA):
+            (self._folder / name).mkdir(exist_ok=True)
+            for path in self._folder.glob(f"{name}/*.png"):
+                path.unlink()
+        file = open(self._folder / TABLE, "w", newline="", encoding="utf-8")  # noqa: SIM115 - closed with the stack
+        self._stack.enter_context(file)
+        csv.DictWriter(file, COLUMNS).writeheader()
+        np.savetxt(self._folder / INTRINSICS, np.asarray(first.frame.output.K)[0])
+        return file
 
     def write(self, result: LiveResult) -> None:
         """Write the images of a result, then its row."""
         name = f"{result.frame.number:06d}.png"
         sigma = result.frame.output.sigma
         try:
+            if self._file is None:
+                self._file = self._begin(result)
             save_png(as_rgb_image(result.frame.left), self._folder / LEFT / name)
             write_depth_mm(self._folder / DEPTH / name, result.depth_m)
             if sigma is not None:
                 sigma_m = np.where(result.depth_m > 0, single_map(sigma), np.nan)
                 write_sigma_mm(self._folder / SIGMA / name, sigma_m)
-            if not (self._folder / INTRINSICS).exists():
-                np.savetxt(self._folder / INTRINSICS, np.asarray(result.frame.output.K)[0])
-            self._table.writerow(result.row)
+            csv.DictWriter(self._file, COLUMNS).writerow(result.row)
             self._file.flush()
         except OSError as error:
             raise_unwritable(self._folder, error)

@@ -325,6 +325,26 @@ def test_maps_and_lists_of_a_workspace_are_those_of_its_frames(workspace):
     assert (folder / "stereo/consistency_graphs").is_dir()
 
 
+def test_a_workspace_has_no_files_of_frames_of_an_earlier_export(workspace):
+    frames, points, seen, folder = workspace
+    others = [folder / "images/notes.txt", folder / f"stereo/depth_maps/{NAMES[3]}.png.photometric.bin"]
+    for path in others:
+        path.touch()
+    images = dict(zip(NAMES, map(image_of, range(4)), strict=True))
+    results.write_workspace(folder, iter(frames[:2]), images.__getitem__, points, seen[:2])
+    files = [path for path in folder.rglob("*") if path.is_file() and path.parent != folder / "sparse"]
+    of_frames = [
+        folder / file
+        for name in NAMES[:2]
+        for file in (
+            *(f"images/{name}.png", f"depth/{name}.tiff"),
+            *(f"stereo/{kind}_maps/{name}.png.geometric.bin" for kind in ("depth", "normal")),
+        )
+    ]
+    lists = [folder / "stereo/fusion.cfg", folder / "stereo/patch-match.cfg"]
+    assert sorted(files) == sorted(others + of_frames + lists)
+
+
 def read_colmap_map(path) -> np.ndarray:
     """As ``scripts/python/read_write_dense.py`` of COLMAP."""
     content = path.read_bytes()

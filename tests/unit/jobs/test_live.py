@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from geodiff_plugin import InputError
-from geodiff_plugin.formats import read_depth_png
+from geodiff_plugin.formats import locked_folder, read_depth_png
 from geodiff_plugin.jobs import LiveMeter, LiveOptions, live
 from geodiff_plugin.result.output import MetricDepthOutput
 from geodiff_plugin.trust import FactSheet, MatchedFraction
@@ -89,6 +89,47 @@ def test_a_folder_is_replaced_only_with_overwrite(options, pipe):
         results_of(options, pipe=pipe)
     results_of(replace(options, overwrite=True, frames=1), pipe=pipe)
     assert [path.name for path in sorted(Path("out/depth").iterdir())] == ["000000.png"]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"source": ("none.mp4",)}, {"calib": (Path("none.txt"),)}, {"prior": "none"}]
+)
+def test_a_run_that_fails_before_its_first_result_leaves_the_folder_as_it_was(options, pipe, changes):
+    out = Path("results/out")
+    pipe_of = None if "prior" in changes else pipe
+    options = replace(options, out=out, frames=1)
+    with pytest.raises(InputError, match="none"):
+        results_of(replace(options, **changes), pipe=pipe_of)
+    assert not out.parent.exists()
+    results_of(options, pipe=pipe)
+    earlier = contents(out)
+    assert len(earlier) == 5
+    with pytest.raises(InputError, match="none"):
+        results_of(replace(options, overwrite=True, **changes), pipe=pipe_of)
+    assert contents(out) == earlier
+
+
+def test_a_replaced_recording_has_the_intrinsics_of_its_own_run(options, textured_plane, pipe):
+    options = replace(options, out=Path("out"), frames=1)
+    results_of(options, pipe=pipe)
+    fx, baseline = 1.1 * float(textured_plane.K[0, 0]), float(textured_plane.E[0, 3])
+    (other,) = results_of(replace(options, overwrite=True, calib=(), fx=fx, baseline=baseline), pipe=pipe)
+    K = np.loadtxt("out/K.txt")
+    assert K[0, 0] == pytest.approx(fx)
+    np.testing.assert_allclose(K, np.asarray(other.frame.output.K)[0])
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_folder_in_use_or_that_cannot_be_created_is_found_before_the_prior_is_loaded(options, monkeypatch):
+    monkeypatch.setattr(live, "prior_of_options", lambda *_: pytest.fail("loaded"))
+    with locked_folder(Path()), pytest.raises(InputError, match="another run is using"):
+        results_of(replace(options, out=Path(), overwrite=True))
+    Path("file").touch()
+    with pytest.raises(InputError, match="--out"):
+        results_of(replace(options, out=Path("file/out")))
 
 
 def test_depths_that_are_not_reliable_are_holes_in_files_and_rows(options, pipe):
