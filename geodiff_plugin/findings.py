@@ -581,6 +581,13 @@ _KINDS = (
         hint="All other files are written. Install an OpenCV build with video codecs to get the video.",
     ),
     FindingKind(
+        "depth.reprojected-empty",
+        WARNING,
+        "The camera of --reproject sees no depth",
+        cause="It looks in another direction, or is too far away.",
+        hint="Check that its E is its pose in the left camera's frame (camera-to-world), in metres.",
+    ),
+    FindingKind(
         "pairs.in-order",
         WARNING,
         "The images of two folders are paired by position, not by name",

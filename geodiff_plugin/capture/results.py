@@ -556,7 +556,7 @@ def _write_frame_files(folder: Path, frame: DepthFrame, rgb: Image.Image) -> Non
 
 
 def _delete_others(folder: Path, names: Collection[str]) -> None:
-    """Delete the files ``PER_FRAME`` of other frames than those of the names."""
+    """Delete the files ``PER_FRAME`` of frames without one of these names."""
     for place, suffix in PER_FRAME.items():
         for path in (folder / place).glob(f"*{suffix}"):
             if path.name.removesuffix(suffix) not in names:

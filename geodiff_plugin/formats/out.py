@@ -159,7 +159,7 @@ def _lock(path: Path, stack: ExitStack, shared: bool = False) -> IO[bytes] | Non
 
 @contextmanager
 def created_folder(folder: Path) -> Iterator[None]:
-    """Create a folder and its missing parents; when the block ends, delete those of them that are empty."""
+    """Create a folder and its missing parents; when the block ends, delete the empty ones."""
     with ExitStack() as stack:
         for path in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
             path.mkdir(exist_ok=True)

@@ -127,7 +127,11 @@ def _posed(options: DepthOptions, taken: OriginalImages) -> ViewCameras:
         for camera, (name, path) in zip((rig.left, rig.right), options.image_files().items(), strict=False):
             warn_of_other_lens(path, camera.K, name)
     further = [_read_view_K(path) for path in options.view_k] or [rig.K_left] * len(options.view)
-    poses = (check_pose(read_matrix(path, "--view-E"), f"--view-E {path}") for path in options.view_e)
+    poses = [check_pose(read_matrix(path, "--view-E"), f"--view-E {path}") for path in options.view_e]
+    if options.e is not None and options.baseline is not None:  # one tracker's poses have one scale
+        given_m = np.linalg.norm(read_matrix(options.e, "--E")[:3, 3])
+        for E in poses:
+            E[:3, 3] *= np.linalg.norm(rig.E[:3, 3]) / given_m
     Ks = [rig.K_left, rig.K_right, *further]
     cameras = tuple(
         Camera(K, size) for K, size in zip(Ks, sizes, strict=False)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from geodiff_plugin import __version__
-from geodiff_plugin._internal.checks import InputError, warn
+from geodiff_plugin._internal.checks import InputError, bad_value, warn
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import write_agreement, write_results
 from geodiff_plugin.findings import as_records
@@ -76,6 +76,7 @@ def _depth_of_frames(
     capture: Capture, options: CaptureOptions, names: Sequence[str], progress: Progress
 ) -> Record:
     """Run the job in its locked folder."""
+    _check_workspace(capture, options)
     made_from = Provenance.of(capture, options)
     check_poses(made_from, options.out, options.overwrite)
     if not options.poses_only:
@@ -110,6 +111,20 @@ def _depth_of_frames(
     }
     write_text(options.out / SUMMARY, json.dumps(report, indent=2) + "\n")
     return report
+
+
+def _check_workspace(capture: Capture, options: CaptureOptions) -> None:
+    """Reject an export that would replace images of the capture itself.
+
+    Raises:
+        InputError: The folder of the COLMAP workspace contains an image of the capture.
+    """
+    workspace = (options.out / "colmap").resolve()
+    if "colmap" in options.export and any(
+        workspace in frame.image.resolve().parents for frame in capture.frames
+    ):
+        hint = "Choose a different folder; the export would replace them."
+        bad_value("--out", "a folder whose colmap/ has no images of the capture", str(options.out), hint)
 
 
 def _join_frames(capture: Capture, options: CaptureOptions, names: Sequence[str], outcome: Record) -> Record:

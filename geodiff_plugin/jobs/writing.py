@@ -9,10 +9,12 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin import formats, plotting
+from geodiff_plugin._internal.checks import warn
 from geodiff_plugin._internal.reprojection import maps_in_camera
 from geodiff_plugin.cameras import Camera, PosedCamera
 from geodiff_plugin.capture.results import EVERY_DEPTH, FinishedFrame, Thresholds, reliable
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.findings import Finding
 from geodiff_plugin.formats import REPORT, HeldFolder, OutFolder, in_8_bits, save_png
 from geodiff_plugin.jobs.finished import Row, row_of
 from geodiff_plugin.jobs.memory import fitting_memory
@@ -208,6 +210,9 @@ def write_reprojected(
         formats.write_depth_npy(folder / SIGMA_REPROJECTED[0], sigma_seen_m)
         formats.write_sigma_mm(folder / SIGMA_REPROJECTED[1], sigma_seen_m)
     known = round(float((seen_m > 0).mean()), 4)
+    if not known:
+        hint = "Check that its E is its pose in the left camera's frame (camera-to-world), in metres."
+        warn(Finding("depth.reprojected-empty", f"The camera of --reproject sees no depth. {hint}"))
     return {
         "K": other.K.tolist(),
         "E": other.E.tolist(),

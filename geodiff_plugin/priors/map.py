@@ -31,6 +31,8 @@ KNOWN_WEIGHT = 100.0
 FILL_STEPS = 20
 #: Known fraction above which a pixel of a resized map keeps the map's value.
 ALL_KNOWN = 0.999
+#: Smallest depth relative to the median above which zeros of a map are holes. Depth in 256 levels is below.
+ZERO_GAP = 0.05
 #: Image pixels per map pixel above which edges are sharpened after upsampling.
 MIN_UPSAMPLING = 1.5
 #: Offset that turns a map in [0, 1] into a substitute for inverse depth, in which edges are relative steps.
@@ -95,9 +97,10 @@ class DepthMapPipeline(DirectMapPipeline):
         """Resample the maps to the image's grid, from 0 to about 1, with holes filled smoothly.
 
         ``depth_map`` has one map ``(h, w)`` per image, of any size and unit, that covers the same view, as an
-        array ``(N, h, w)`` or a list; non-finite where unknown.
+        array ``(N, h, w)`` or a list; non-finite where unknown, or 0 in a depth map that is far above 0
+        elsewhere.
         """
-        maps = _as_list(depth_map)
+        maps = _as_list(depth_map, self.space)
         if len(maps) != len(image):
             bad_value("depth_map", f"one map (h, w) for each of {len(image)} images", f"{len(maps)}")
         size = image_size(image)
@@ -130,7 +133,7 @@ def _metres(space: str, low: float, high: float) -> tuple[float, float]:
     return (float(ends_m[0]), float(ends_m[1])) if can_be_metres else (math.nan, math.nan)
 
 
-def _as_list(given: Any) -> list[tuple[Tensor, float]]:
+def _as_list(given: Any, space: str) -> list[tuple[Tensor, float]]:
     """Convert ``depth_map`` to maps ``(1, 1, h, w)`` float32 starting at 0, and their minima before that.
 
     They are NaN where unknown.
@@ -143,10 +146,16 @@ def _as_list(given: Any) -> list[tuple[Tensor, float]]:
         given = [given] if given.ndim == 2 else list(given)
     if not isinstance(given, (list, tuple)) or not all(isinstance(m, (np.ndarray, Tensor)) for m in given):
         bad_type("depth_map", "an array (h, w) or (N, h, w), or a list of arrays (h, w)", given)
-    return [_from_zero(each) for each in given]
+    return [_from_zero(each, space) for each in given]
 
 
-def _from_zero(given: np.ndarray | Tensor) -> tuple[Tensor, float]:
+def _has_empty_zeros(known: Tensor) -> bool:
+    """Whether the zeros of a depth map ``(N,)`` mean unknown, because all other depths are far above 0."""
+    others = known[known != 0]
+    return 0 < len(others) < len(known) and bool(others.min() > ZERO_GAP * others.median())
+
+
+def _from_zero(given: np.ndarray | Tensor, space: str = "depth") -> tuple[Tensor, float]:
     """Return a map minus its minimum, ``(1, 1, h, w)`` float32, NaN where unknown, and the minimum."""
     values = torch.as_tensor(np.ascontiguousarray(given) if isinstance(given, np.ndarray) else given)
     if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():
@@ -155,6 +164,8 @@ def _from_zero(given: np.ndarray | Tensor) -> tuple[Tensor, float]:
     # float32.
     values = values if values.dtype in (torch.float32, torch.float64) else values.float()
     inside = values.isfinite()
+    if space == "depth" and _has_empty_zeros(values[inside]):
+        inside &= values != 0
     if not inside.any() or values[inside].min() == values[inside].max():
         hint = "Non-finite values mean unknown; a map needs at least two different depths."
         bad_value("depth_map", "a map with two different finite values", "none", hint)

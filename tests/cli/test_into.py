@@ -59,6 +59,16 @@ def test_a_pair_is_written_as_the_other_camera_sees_it(pair_files, geodiff, tmp_
     assert files <= set(report_of(tmp_path / "o")["files"]["names"])
 
 
+def test_a_camera_that_sees_nothing_is_reported(pair_files, geodiff, tmp_path):
+    """Its pose is in centimetres."""
+    E = np.array(E_TO)
+    E[0, 3] = 1500.0
+    words = [*pair_files.command, *QUICK, "--reproject", camera_file(tmp_path, E=E.tolist()), "--out", "o"]
+    answer = geodiff(*words)
+    assert answer.code == 0 and "The camera of --reproject sees no depth. Check that its E" in answer.err
+    assert report_of(tmp_path / "o")["reproject"]["known_fraction"] == 0
+
+
 def test_the_text_of_a_realsense_is_the_camera_of_its_colour_images(pair_files, geodiff, tmp_path):
     size, text = (80, 56), "Intrinsic Parameters:\n\n"
     for sizes in (size, (160, 112)):

@@ -80,6 +80,13 @@ def test_a_measured_baseline_is_the_length_of_e_and_keeps_its_direction(files, t
     E[:3, 3] = (0.06, 0.0, -0.08)
     np.testing.assert_allclose(measured.E, E)
     assert not estimated.measured and measured.measured
+    further = np.eye(4)
+    further[:3, 3] = 0.0, 1.0, 0.0
+    np.savetxt(tmp_path / "F.txt", further)
+    more = options(files, "third", e=tmp_path / "E.txt", view_e=(tmp_path / "F.txt",), baseline=0.1)
+    images = [np.zeros((*SIZES[0][::-1], 3), np.float32)] * 3
+    poses = read_cameras(more, OriginalImages(images, from_files=False)).poses
+    np.testing.assert_allclose(poses[2][:3, 3], [0, 0.2, 0])
     E[:3, 3] = 0
     np.savetxt(tmp_path / "E.txt", E)
     with pytest.raises(InputError, match="Both its cameras have the same position"):

@@ -185,6 +185,22 @@ def test_the_ends_of_a_map_in_metres_are_known(space, step):
     assert (nearest, farthest) == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("space", "lowest", "unknown"), [("depth", 0.5, 1), ("depth", 0.01, 0), ("disparity", 0.5, 0)]
+)
+def test_zeros_far_below_all_other_depths_are_holes(space, lowest, unknown):
+    """Not those of a map that is scaled to [0, 1], nor a disparity of 0, which is far away."""
+    pipe = load_prior("map", space=space)
+    values = np.linspace(lowest, 6.0, SIZE[0] * SIZE[1]).reshape(SIZE)
+    values[4:8, 4:8] = 0.0
+    condition(pipe, values)
+    valid = pipe.maps_of(slice(None)).valid
+    assert (valid is not None and not valid[0, 0, 4:8, 4:8].any()) == unknown
+    mixed = np.concatenate([[-1.0], values.ravel()[1:]]).reshape(SIZE)
+    condition(pipe, mixed)
+    assert pipe.maps_of(slice(None)).valid is None, "with depths below 0, 0 is one of them"
+
+
 def test_a_map_with_values_below_0_is_not_in_metres(pipe):
     below, above = make_map() - 6, make_map()
     condition(pipe, below)
