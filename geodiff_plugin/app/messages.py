@@ -14,7 +14,7 @@ from geodiff_plugin._internal.checks import InputError, UnknownFormatError
 from geodiff_plugin.findings import Finding
 
 #: Prefixes of the codes of findings that the page cannot cause: it takes two images and no points.
-NOT_ON_THE_PAGE = ("capture.", "pairs.", "points.", "config.")
+NOT_ON_THE_PAGE = ("capture.", "pairs.", "points.", "config.", "depth.reprojected-empty")
 
 
 class PageError(InputError):
