@@ -121,10 +121,14 @@ def add_depth(source: Any, pipe: Any, rig: Rig, options: argparse.Namespace) -> 
     features = {
         k: each for k, each in source.features.items() if k not in ADDED and each["dtype"] != "language"
     }
+    dataset = create_copy(source, features, options)
     try:
-        depth_m = copy_frames(source, features, pipe, rig, options)
+        depth_m = copy_frames(source, features, dataset, pipe, rig, options)
     except BaseException:
-        shutil.rmtree(options.out, ignore_errors=True)
+        try:
+            dataset.finalize()  # LeRobot would write its last files after they are deleted
+        finally:
+            shutil.rmtree(options.out, ignore_errors=True)
         raise
     stored_m = channels_last(open_dataset(options.out)[len(source) - 1][DEPTH])
     known = depth_m > 0
@@ -135,10 +139,9 @@ def add_depth(source: Any, pipe: Any, rig: Rig, options: argparse.Namespace) -> 
 
 
 def copy_frames(
-    source: Any, features: dict[str, Any], pipe: Any, rig: Rig, options: argparse.Namespace
+    source: Any, features: dict[str, Any], dataset: Any, pipe: Any, rig: Rig, options: argparse.Namespace
 ) -> np.ndarray:
-    """Write all frames with their depth to a new dataset; return the last depth ``(H, W, 1)`` in metres."""
-    dataset = create_copy(source, features, options)
+    """Write all frames with their depth to a dataset; return the last depth ``(H, W, 1)`` in metres."""
     frames = stereo_frames(source, options.left, options.right)
     episode = 0
     for result in live(pipe, frames, rig, every_frame=True, num_inference_steps=options.steps):
