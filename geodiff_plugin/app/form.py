@@ -43,8 +43,8 @@ CALIBRATION_HEIGHT = 104
 DROP_HERE = "Drop or choose"
 #: Options of handlers that only the page calls.
 QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
-#: Options of handlers that each of several quick events reaches, in order. In gradio's other modes, an event
-#: is dropped, or an earlier one is handled last.
+#: Options of handlers that each of several quick events reaches, in order unless the machine is busy. In
+#: gradio's other modes, an event is dropped, or an earlier one is handled last.
 IN_ORDER = QUICK | {"queue": True, "concurrency_limit": 1, "trigger_mode": "multiple"}
 #: Labels of the optional number fields.
 NUMBERS = {
@@ -93,7 +93,7 @@ class Form:
             if named[side] and not Path(named[side]).is_file():
                 raise PageError(f"The {side} image is no longer on the server. Drop it again.")
         shown = _shown(*(named[name] for name in ("camera_input", "camera", "scale_input")))
-        for name in NUMBERS:  # of fields that are not shown, whatever was typed there has no meaning
+        for name in NUMBERS:  # text in a field that is no longer shown is ignored
             named[name] = _number(named[name], name) if shown.get(GROUPS.get(name, name), True) else None
         named["lens"] = {name: named.pop(name) for name in ("fx", "fy", "cx", "cy")}
         named |= {name: int(named[name] or 0) for name in ("steps", "ensemble", "resolution", "seed")}
@@ -318,7 +318,7 @@ def _length_fields(drawn: dict[str, Any]) -> None:
     drawn["ends"] = gr.Textbox(
         label="Its two ends, px", placeholder="tap them above", max_lines=1, elem_id="ends"
     )
-    # At once: they are of the previous image.
+    # Cleared at once, because both belong to the previous image.
     drawn["left"].change(None, None, [image, drawn["ends"]], js="() => ['', '']", queue=False)
     drawn["left"].change(_known_image, drawn["left"], image, **IN_ORDER)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -98,10 +98,10 @@ def _loaded(folder: Path, maps: Mapping[str, str]) -> dict[str, np.ndarray]:
     return {field: _read_map(folder / f"{file}.npy") for file, field in maps.items()}
 
 
-def _read_map(path: Path) -> np.ndarray:
+def _read_map(path: Path, mmap_mode: Literal["r"] | None = None) -> np.ndarray:
     """Read a map of a result; the error for a missing or damaged file names it."""
     try:
-        values: np.ndarray = np.load(path)
+        values: np.ndarray = np.load(path, mmap_mode=mmap_mode)
     except (OSError, ValueError, EOFError) as error:
         hint = "Delete its folder and run the command that wrote it again."
         reason = reason_of(error) if isinstance(error, OSError) else error
@@ -259,8 +259,8 @@ def _alone(frame: FinishedFrame) -> DepthFrame:
     folder = frame.folder
     if not all((folder / f"{file}.npy").is_file() for file in ALONE):
         paths = [folder / f"{name}.npy" for name in ("confidence", "sigma")]
-        further = [np.load(path) if path.is_file() else None for path in paths]
-        save_alone(folder, np.load(folder / "depth.npy"), *further)
+        further = [_read_map(path) if path.is_file() else None for path in paths]
+        save_alone(folder, _read_map(folder / "depth.npy"), *further)
     return frame.read(ALONE)
 
 
@@ -354,10 +354,10 @@ def common_range(
     """
     depths, measured_depths = [], []
     for folder in folders:
-        depth = _read_map(folder / "depth.npy")
+        depth = _read_map(folder / "depth.npy", "r")
         valid = _sparse(depth) > 0
         if (path := folder / "confidence.npy").is_file():
-            confidence = _read_map(path)
+            confidence = _read_map(path, "r")
             if confidence.shape != depth.shape:
                 bad_value(str(path), f"of shape {depth.shape}, like depth.npy", f"{confidence.shape}")
             valid &= _sparse(confidence) > 0
@@ -376,7 +376,7 @@ def _sheet(
     shown = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, ON_SHEET).astype(int))]
     cells: list[Any] = []
     for name in shown:
-        drawn = plotting.depth_figure(np.load(out / name / "depth.npy"), *ends, unit=capture.unit)
+        drawn = plotting.depth_figure(_read_map(out / name / "depth.npy"), *ends, unit=capture.unit)
         cells += [capture.image(name), drawn]
     titles = [t for name in shown for t in (name, "depth, not trusted" if name in doubted else "depth")]
     with atomic_path(out / "sheet.jpg") as temporary:
@@ -391,7 +391,7 @@ def _video(capture: Capture, out: Path, names: Sequence[str], ends: tuple[float,
 
     def frames() -> Iterator[Image.Image]:
         for name in names:
-            drawn = plotting.depth_figure(np.load(out / name / "depth.npy"), *ends, unit=capture.unit)
+            drawn = plotting.depth_figure(_read_map(out / name / "depth.npy"), *ends, unit=capture.unit)
             photo = plotting.as_rgb_image(capture.image(name))
             photo = photo.resize((round(photo.width * drawn.height / photo.height), drawn.height))
             yield ImageOps.pad(Image.fromarray(np.hstack([np.asarray(photo), np.asarray(drawn)])), VIDEO_SIZE)

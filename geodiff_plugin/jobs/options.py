@@ -132,8 +132,8 @@ class RigOptions(RunOptions):
     )
     baseline: float | None = _camera(
         None,
-        "Measured baseline in metres. Overrides the baseline in --calib. Given --E, the translations of --E "
-        "and --view-E are scaled so that the one of --E has this length.",
+        "Measured baseline in metres. Overrides the baseline in --calib. With --E, scales the translations "
+        "in --E and --view-E to match.",
         own_check=check_baseline_m,
     )
     fx: float | None = _camera(None, "Focal length along x in pixels.")

@@ -155,7 +155,7 @@ def _has_empty_zeros(known: Tensor) -> bool:
     return 0 < len(others) < len(known) and bool(others.min() > ZERO_GAP * others.median())
 
 
-def _from_zero(given: np.ndarray | Tensor, space: str = "depth") -> tuple[Tensor, float]:
+def _from_zero(given: np.ndarray | Tensor, space: str) -> tuple[Tensor, float]:
     """Return a map minus its minimum, ``(1, 1, h, w)`` float32, NaN where unknown, and the minimum."""
     values = torch.as_tensor(np.ascontiguousarray(given) if isinstance(given, np.ndarray) else given)
     if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():

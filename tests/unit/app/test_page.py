@@ -418,7 +418,7 @@ def test_a_later_click_ends_the_earlier_run_without_a_message(desk, jobs):
 
 
 def test_a_run_that_begins_before_the_earlier_result_is_drawn_draws_it(page, desk, jobs, monkeypatch):
-    """The earlier result is already that of the tab, so it is what the later run keeps on display."""
+    """The earlier result already belongs to the tab, so the later run keeps it on display."""
     screen, second, draw = Screen(desk), [], page.module.drawn
 
     def click_again(*given):

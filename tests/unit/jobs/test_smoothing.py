@@ -134,7 +134,7 @@ def test_the_report_describes_the_smoothed_maps_and_keeps_the_values_of_the_fram
 
 
 def test_maps_with_removed_depths_have_no_mean_confidence(run):
-    """The confidence of removed depths is removed as well, so a mean would be that of the best pixels."""
+    """The confidence of removed depths is removed as well, so a mean would describe only the best pixels."""
     options = replace(run["options"], holes=True, min_confidence=0.5)
     for report in write_smoothed_frames(options, run["refs"][:2], lambda ref: None):
         assert report["temporal_smoothing"]["confidence_mean"] is None
